@@ -1,0 +1,112 @@
+"""Masked autoregressive spline flow (Papamakarios et al. 2017; Durkan et al. 2019), without learned rotations.
+
+Each transform's splines for dimension i are read off a masked MLP (MADE, Germain et al. 2015) over the dimensions
+before i; the order alternates between transforms. The Jacobian is triangular in the transform's own order.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from model.networks import splines
+
+
+@dataclass(frozen=True)
+class FlowShape:
+    """Sizes of a flow.
+
+    Attributes:
+        latent_size: D.
+        transforms: number of autoregressive transforms.
+        bins: K of each spline.
+        width: hidden units of each of the two hidden layers of a conditioner.
+        bound: the splines act on [-bound, bound].
+    """
+
+    latent_size: int = 64
+    transforms: int = 2
+    bins: int = 6
+    width: int = 64
+    bound: float = 5.0
+
+
+class MaskedLinear(nn.Linear):
+    """Linear layer whose weights are multiplied by a fixed binary mask."""
+
+    mask: Tensor
+
+    def __init__(self, mask: Float[Tensor, "out in"]) -> None:
+        super().__init__(mask.shape[1], mask.shape[0])
+        self.register_buffer("mask", mask)
+
+    def forward(self, value: Float[Tensor, "*b in"]) -> Float[Tensor, "*b out"]:
+        """``(mask * W) x + b``."""
+        return functional.linear(value, self.mask * self.weight, self.bias)
+
+
+class SplineTransform(nn.Module):
+    """One autoregressive transform ``y_i = spline(x_i; c(x before i))``."""
+
+    def __init__(self, shape: FlowShape, *, reverse: bool) -> None:
+        super().__init__()
+        self.shape = shape
+        order = torch.arange(shape.latent_size)
+        order = order.flip(0) if reverse else order
+        hidden = torch.arange(shape.width) % max(1, shape.latent_size - 1)
+        outputs = order.repeat_interleave(splines.parameter_count(shape.bins))
+        self.first = MaskedLinear((hidden[:, None] >= order[None, :]).float())
+        self.second = MaskedLinear((hidden[:, None] >= hidden[None, :]).float())
+        self.last = MaskedLinear((outputs[:, None] > hidden[None, :]).float())
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def knots(self, x: Float[Tensor, "b d"]) -> splines.Knots:
+        """Knots of every dimension's spline, each from the dimensions before it."""
+        value = functional.silu(self.second(functional.silu(self.first(x))))
+        raw = self.last(value).unflatten(-1, (self.shape.latent_size, splines.parameter_count(self.shape.bins)))
+        return splines.knots_of(raw, self.shape.bins, self.shape.bound)
+
+    def forward(self, x: Float[Tensor, "b d"]) -> tuple[Float[Tensor, "b d"], Float[Tensor, "b"]]:
+        """``y`` and ``log |det dy/dx|``."""
+        y, log_slope = splines.forward(x, self.knots(x), self.shape.bound)
+        return y, log_slope.sum(dim=-1)
+
+    def inverse_step(self, y: Float[Tensor, "b d"], guess: Float[Tensor, "b d"]) -> Float[Tensor, "b d"]:
+        """One fixed-point step towards ``x``; after k steps the first k dimensions (in order) are exact."""
+        return splines.inverse(y, self.knots(guess), self.shape.bound)
+
+    def inverse(self, y: Float[Tensor, "b d"]) -> Float[Tensor, "b d"]:
+        """``x`` with ``forward(x) = y``: fixed point of `inverse_step`, exact after at most D steps."""
+        x = y
+        for _ in range(self.shape.latent_size):
+            following = self.inverse_step(y, x)
+            if torch.equal(following, x):
+                break
+            x = following
+        return x
+
+
+class SplineFlow(nn.Module):
+    """Composition of autoregressive transforms in alternating order."""
+
+    def __init__(self, shape: FlowShape) -> None:
+        super().__init__()
+        self.shape = shape
+        self.transforms = nn.ModuleList([SplineTransform(shape, reverse=i % 2 == 1) for i in range(shape.transforms)])
+
+    def forward(self, x: Float[Tensor, "b d"]) -> tuple[Float[Tensor, "b d"], Float[Tensor, "b"]]:
+        """``g(x)`` and ``log |det dg/dx|``."""
+        total = torch.zeros_like(x[..., 0])
+        for transform in self.transforms:
+            x, log_det = transform(x)
+            total = total + log_det
+        return x, total
+
+    def inverse(self, y: Float[Tensor, "b d"]) -> Float[Tensor, "b d"]:
+        """``g^-1(y)``."""
+        for transform in reversed(self.transforms):
+            y = transform.inverse(y)
+        return y
