@@ -1,0 +1,152 @@
+"""Training of decoder, prior and one latent code a shape (auto-decoder, Park et al. 2019)."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from model.networks.decoder import OccupancyDecoder
+from model.networks.prior import LatentPrior
+from training.config import TrainingConfig
+from training.objective import gaussian_entropy, reconstruction_loss
+from training.samples import Batch, PointPool, ShapePoints
+
+#: Called after each step with the step's number and its figures.
+Watch = Callable[[int, dict[str, float]], None]
+
+
+class AutoDecoder(nn.Module):
+    """Decoder, prior, and a Gaussian over each training shape's code (a point when the objective is the paper's)."""
+
+    def __init__(self, config: TrainingConfig, shapes: int) -> None:
+        super().__init__()
+        self.config = config
+        self.decoder = OccupancyDecoder(config.decoder)
+        self.prior = LatentPrior(config.prior)
+        size = config.decoder.latent_size
+        spread = config.prior.initial_sigma
+        self.mean = nn.Parameter(0.2 * spread * torch.randn(shapes, size))
+        self.log_deviation = nn.Parameter(torch.full((shapes, size), math.log(0.3 * spread)))
+
+    @property
+    def variational(self) -> bool:
+        """Whether codes are distributions."""
+        return self.config.objective.name == "variational"
+
+    def draw_codes(self, chosen: Int[Tensor, "b"], generator: torch.Generator) -> Float[Tensor, "b d"]:
+        """A reparameterised draw of the chosen shapes' codes, or the codes themselves."""
+        mean = self.mean[chosen]
+        if not self.variational:
+            return mean
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        return mean + self.log_deviation[chosen].exp() * noise
+
+    def loss(self, chosen: Int[Tensor, "b"], batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
+        """The joint objective and its terms, means over the chosen shapes."""
+        weights = self.config.objective
+        codes = self.draw_codes(chosen, generator)
+        with torch.autocast("cuda", torch.bfloat16, enabled=codes.is_cuda):
+            logits = self.decoder(codes, batch.points)
+        rec = reconstruction_loss(weights.reconstruction, logits.float(), batch.labels, batch.weights).mean()
+        density = -self.prior.log_density(codes)
+        if self.variational:
+            density = density - gaussian_entropy(self.log_deviation[chosen])
+        ard = self.prior.ard_loss(weights.a, weights.b)
+        total = rec + weights.lambda_flow * density.mean()
+        if self.config.prior.use_ard:
+            total = total + weights.lambda_ard * ard / len(self.mean)
+        return {"loss": total, "reconstruction": rec, "prior": density.mean(), "ard": ard}
+
+
+@dataclass
+class Trainer:
+    """One run: owns the module, the optimiser and the random stream, and can be saved and resumed exactly."""
+
+    config: TrainingConfig
+    module: AutoDecoder
+    pool: PointPool
+    optimiser: torch.optim.Optimizer
+    generator: torch.Generator
+    step: int = 0
+
+    @classmethod
+    def start(cls, config: TrainingConfig, shapes: Sequence[ShapePoints]) -> "Trainer":
+        """A fresh run, seeded."""
+        device = torch.device(config.device)
+        torch.manual_seed(config.seed)
+        module = AutoDecoder(config, len(shapes)).to(device)
+        generator = torch.Generator(device=device).manual_seed(config.seed)
+        return cls(config, module, PointPool(shapes, device), _optimiser(module, config), generator)
+
+    def advance(self) -> dict[str, float]:
+        """One optimiser step; returns its figures."""
+        config = self.config
+        self._schedule()
+        size = min(config.batch_shapes, self.pool.size)
+        chosen = torch.randperm(self.pool.size, generator=self.generator, device=self.pool.device)[:size]
+        batch = self.pool.draw(chosen, (config.near_points, config.far_points), self.generator)
+        terms = self.module.loss(chosen, batch, self.generator)
+        self.optimiser.zero_grad(set_to_none=True)
+        terms["loss"].backward()
+        nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
+        self.optimiser.step()
+        self.step += 1
+        return {name: value.item() for name, value in terms.items()}
+
+    def _schedule(self) -> None:
+        progress = self.step / self.config.steps
+        rise = min(1.0, progress / self.config.warm_up) if self.config.warm_up > 0 else 1.0
+        factor = rise * 0.5 * (1.0 + math.cos(math.pi * progress))
+        for group in self.optimiser.param_groups:
+            waiting = group["name"] == "flow" and progress < self.config.flow_start
+            group["lr"] = 0.0 if waiting else group["full_lr"] * factor
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint; replaced in one move, so that a killed run leaves a whole one."""
+        state = {
+            "config": self.config.as_dict(),
+            "step": self.step,
+            "module": self.module.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+        part = path.with_suffix(".part")
+        torch.save(state, part)
+        part.replace(path)
+
+    def load(self, path: Path) -> None:
+        """Continue from a checkpoint of the same configuration; the result is that of an unbroken run."""
+        state = torch.load(path, map_location=self.pool.device, weights_only=True)
+        self.module.load_state_dict(state["module"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["generator"].cpu())
+        self.step = state["step"]
+
+
+def _optimiser(module: AutoDecoder, config: TrainingConfig) -> torch.optim.Optimizer:
+    codes = [module.mean, module.log_deviation]
+    groups = [
+        ("decoder", list(module.decoder.parameters()), config.learning_rate, config.weight_decay),
+        ("flow", list(module.prior.flow.parameters()), config.flow_learning_rate, config.weight_decay),
+        ("sigma", [module.prior.log_sigma], config.code_learning_rate, 0.0),
+        ("codes", codes, config.code_learning_rate, 0.0),
+    ]
+    return torch.optim.AdamW(
+        [{"name": n, "params": p, "lr": r, "full_lr": r, "weight_decay": w} for n, p, r, w in groups],
+        betas=(0.9, 0.99),
+    )
+
+
+def train(trainer: Trainer, folder: Path, watch: Watch = lambda step, figures: None) -> AutoDecoder:
+    """Run to the configured number of steps with checkpoints in ``folder/checkpoint.pt``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    while trainer.step < trainer.config.steps:
+        figures = trainer.advance()
+        watch(trainer.step, figures)
+        if trainer.step % trainer.config.checkpoint_every == 0 or trainer.step == trainer.config.steps:
+            trainer.save(folder / "checkpoint.pt")
+    return trainer.module

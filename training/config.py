@@ -1,0 +1,80 @@
+"""What a training run is made of; written beside its checkpoints and into the exported manifest."""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from model.networks.decoder import DecoderShape
+from model.networks.flow import FlowShape
+from model.networks.prior import PriorShape
+
+Regime = Literal["thin", "thick", "orthogonal", "dense"]
+ObjectiveName = Literal["paper", "variational"]
+ReconstructionName = Literal["dice", "bce", "bce_dice"]
+
+
+@dataclass(frozen=True)
+class ObjectiveConfig:
+    """Weights of the joint objective.
+
+    Attributes:
+        name: ``paper`` treats codes as points and adds the negative log prior density; ``variational`` treats each code
+            as a diagonal Gaussian and adds the Kullback-Leibler divergence to the prior, which keeps the density bounded.
+        reconstruction: loss over sampled points and labels.
+        lambda_flow: weight of the density or divergence term against the mean loss over points.
+        lambda_ard: weight of the Gamma prior on the precisions.
+        a, b: shape and rate of that Gamma prior; a > 1, b < 1.
+    """
+
+    name: ObjectiveName = "variational"
+    reconstruction: ReconstructionName = "bce"
+    lambda_flow: float = 1e-3
+    lambda_ard: float = 1e-3
+    a: float = 1.5
+    b: float = 1e-4
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """One training run.
+
+    Attributes:
+        steps: optimiser steps; `batch_shapes` shapes a step, each with `near_points` points close to its contour and
+            `far_points` elsewhere.
+        learning_rate: of the networks; `code_learning_rate` of the latent codes. Both rise over `warm_up` (share of
+            steps) and fall to zero along a cosine.
+        flow_start: share of steps after which the flow is trained; it is the identity before.
+    """
+
+    decoder: DecoderShape = field(default_factory=DecoderShape)
+    prior: PriorShape = field(default_factory=lambda: PriorShape(FlowShape()))
+    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    regime: Regime = "dense"
+    steps: int = 6000
+    batch_shapes: int = 32
+    near_points: int = 192
+    far_points: int = 64
+    learning_rate: float = 2e-3
+    code_learning_rate: float = 1e-2
+    flow_learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    warm_up: float = 0.03
+    flow_start: float = 0.3
+    seed: int = 0
+    device: str = "cpu"
+    checkpoint_every: int = 500
+
+    def as_dict(self) -> dict[str, Any]:
+        """Nested plain values, for JSON."""
+        return asdict(self)
+
+
+def config_from_dict(values: dict[str, Any]) -> TrainingConfig:
+    """Inverse of `TrainingConfig.as_dict`."""
+    prior = dict(values["prior"])
+    prior["flow"] = FlowShape(**prior["flow"])
+    parts = {
+        "decoder": DecoderShape(**values["decoder"]),
+        "prior": PriorShape(**prior),
+        "objective": ObjectiveConfig(**values["objective"]),
+    }
+    return TrainingConfig(**{**values, **parts})
