@@ -1,0 +1,159 @@
+"""An outcome as files of one folder, and back: ``summary.json``, ``state.npz`` and ``mesh.npz``.
+
+Arrays are stored exactly and without pickling; everything else is JSON.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.geometry import Grid, Pose
+from model.inference.fitting import Fit, FitStatus
+from model.inference.mesh import Mesh
+from model.inference.observations import Plane
+from model.inference.reconstruction import Estimate, Options, PlaneResidual, Reconstruction, ShapeState
+from service.ports import Outcome
+
+SUMMARY, STATE, MESH = "summary.json", "state.npz", "mesh.npz"
+#: Format of the folder; other ones are not read.
+ARCHIVE_VERSION = 1
+
+
+def write_outcome(folder: Path, outcome: Outcome, times: Mapping[str, float]) -> None:
+    """Write an outcome, with the times of its life (s since 1970), into an existing folder."""
+    np.savez(folder / STATE, allow_pickle=False, **_state_arrays(outcome.reconstruction.state))
+    np.savez_compressed(folder / MESH, allow_pickle=False, **_mesh_arrays(outcome.reconstruction.mesh))
+    document = {"archive": ARCHIVE_VERSION, **times, **_document(outcome)}
+    (folder / SUMMARY).write_text(json.dumps(document), encoding="utf-8")
+
+
+def read_document(folder: Path) -> dict[str, Any]:
+    """``summary.json`` of a folder.
+
+    Raises:
+        OSError, ValueError: it is not there or not of this format.
+    """
+    document: dict[str, Any] = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+    if document.get("archive") != ARCHIVE_VERSION:
+        raise ValueError("written in another format")
+    return document
+
+
+def read_outcome(folder: Path, document: dict[str, Any]) -> Outcome:
+    """The outcome that `write_outcome` wrote.
+
+    Raises:
+        OSError, ValueError, KeyError: a file is missing or damaged.
+    """
+    with np.load(folder / STATE, allow_pickle=False) as arrays:
+        state = _state(dict(arrays), document["fits"])
+    with np.load(folder / MESH, allow_pickle=False) as arrays:
+        mesh = _mesh(dict(arrays))
+    answer = document["reconstruction"]
+    reconstruction = Reconstruction(
+        state=state,
+        mesh=mesh,
+        planes=tuple(Plane(**plane) for plane in answer["planes"]),
+        observation_count=answer["observation_count"],
+        residuals=tuple(
+            PlaneResidual(Plane(**r["plane"]), r["disagreement"], r["mean_error"]) for r in answer["residuals"]
+        ),
+        volume_ml=Estimate(**answer["volume_ml"]),
+        area_cm2=Estimate(**answer["area_cm2"]),
+        log_prior_density=answer["log_prior_density"],
+        typicality_percentile=answer["typicality_percentile"],
+        warnings=tuple(answer["warnings"]),
+    )
+    grid = Grid(tuple(document["grid"]["shape"]), np.array(document["grid"]["affine"]))
+    model = document["model"]
+    return Outcome(
+        model["name"], model["version"], model["digest"], _options(document["options"]), grid, reconstruction
+    )
+
+
+def _document(outcome: Outcome) -> dict[str, Any]:
+    answer = outcome.reconstruction
+    return {
+        "model": {"name": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest},
+        "options": asdict(outcome.options),
+        "grid": {"shape": list(map(int, outcome.grid.shape)), "affine": outcome.grid.affine.tolist()},
+        "fits": [_fit_document(fit) for fit in answer.state.fits],
+        "reconstruction": {
+            "planes": [_plane(plane) for plane in answer.planes],
+            "observation_count": int(answer.observation_count),
+            "residuals": [
+                {"plane": _plane(r.plane), "disagreement": float(r.disagreement), "mean_error": float(r.mean_error)}
+                for r in answer.residuals
+            ],
+            "volume_ml": _estimate(answer.volume_ml),
+            "area_cm2": _estimate(answer.area_cm2),
+            "log_prior_density": float(answer.log_prior_density),
+            "typicality_percentile": float(answer.typicality_percentile),
+            "warnings": list(answer.warnings),
+        },
+    }
+
+
+def _plane(plane: Plane) -> dict[str, int]:
+    return {"stack": int(plane.stack), "axis": int(plane.axis), "index": int(plane.index)}
+
+
+def _estimate(estimate: Estimate) -> dict[str, float | None]:
+    return {name: None if value is None else float(value) for name, value in asdict(estimate).items()}
+
+
+def _options(document: dict[str, Any]) -> Options:
+    annotated = document["annotated"]
+    planes = annotated if isinstance(annotated, str) else tuple(Plane(**plane) for plane in annotated)
+    return Options(**{**document, "annotated": planes})
+
+
+def _fit_document(fit: Fit) -> dict[str, Any]:
+    return {
+        "status": fit.status.value,
+        "message": fit.message,
+        "iterations": int(fit.iterations),
+        "objective": float(fit.objective),
+        "log_scale": float(fit.pose.log_scale),
+        "mirrored": bool(fit.pose.mirrored),
+    }
+
+
+def _state_arrays(state: ShapeState) -> dict[str, np.ndarray]:
+    arrays = {
+        "latent": np.stack([fit.latent for fit in state.fits]),
+        "position": np.stack([fit.pose.position for fit in state.fits]),
+        "rotation": np.stack([fit.pose.rotation for fit in state.fits]),
+        "precision": np.stack([fit.precision for fit in state.fits]),
+    }
+    return arrays if state.covariance is None else {**arrays, "covariance": state.covariance}
+
+
+def _state(arrays: dict[str, np.ndarray], documents: list[dict[str, Any]]) -> ShapeState:
+    fits = tuple(
+        Fit(
+            latent=arrays["latent"][i],
+            pose=Pose(arrays["position"][i], arrays["rotation"][i], document["log_scale"], document["mirrored"]),
+            status=FitStatus(document["status"]),
+            message=document["message"],
+            iterations=document["iterations"],
+            objective=document["objective"],
+            precision=arrays["precision"][i],
+        )
+        for i, document in enumerate(documents)
+    )
+    return ShapeState(fits, arrays.get("covariance"))
+
+
+def _mesh_arrays(mesh: Mesh) -> dict[str, np.ndarray]:
+    scalars = {f"scalar_{name}": values for name, values in mesh.scalars.items()}
+    return {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, **scalars}
+
+
+def _mesh(arrays: dict[str, np.ndarray]) -> Mesh:
+    scalars = {name.removeprefix("scalar_"): values for name, values in arrays.items() if name.startswith("scalar_")}
+    return Mesh(arrays["vertices"], arrays["faces"], arrays["normals"], scalars)

@@ -1,0 +1,147 @@
+"""Results on disk: one folder each, complete or not there, with a time to live.
+
+A folder is written under a temporary name and renamed, so a reader or a restart never meets half of
+one. Deleting renames first as well. Expired results are never served, even before they are swept.
+"""
+
+import re
+import shutil
+import threading
+import time
+import uuid
+import zipfile
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+from service.adapters.archive import read_document, read_outcome, write_outcome
+from service.errors import StoreFull, UnknownResult
+from service.ports import Outcome, StoredResult
+
+_IDENTIFIER = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}\Z")
+_TEMPORARY = ".tmp-"
+#: A temporary folder older than this (s) belongs to a program that is gone.
+_ABANDONED_AFTER_S = 3600.0
+
+
+class DiskResultStore:
+    """The `ResultStore` on a folder of the file system.
+
+    Args:
+        folder: made when it is not there, readable by its owner alone.
+        lifetime_s: how long a result is served.
+        max_bytes: size of all results together; the oldest make room for a new one.
+        clock: seconds since 1970.
+    """
+
+    def __init__(
+        self, folder: Path, *, lifetime_s: float, max_bytes: int, clock: Callable[[], float] = time.time
+    ) -> None:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._folder = folder
+        self._lifetime_s = lifetime_s
+        self._max_bytes = max_bytes
+        self._clock = clock
+        self._lock = threading.Lock()
+
+    def save(self, outcome: Outcome) -> StoredResult:
+        """Keep an outcome; `StoreFull` when it alone is larger than the store."""
+        identifier, now = str(uuid.uuid4()), self._clock()
+        temporary = self._folder / f"{_TEMPORARY}{identifier}"
+        temporary.mkdir(mode=0o700)
+        try:
+            times = {"created": now, "expires": now + self._lifetime_s}
+            write_outcome(temporary, outcome, times)
+            with self._lock:
+                self._make_room(_size(temporary))
+                temporary.rename(self._folder / identifier)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+        return StoredResult(identifier, _moment(now), _moment(times["expires"]), outcome)
+
+    def load(self, identifier: str) -> StoredResult:
+        """A result that has not expired; `UnknownResult` otherwise."""
+        folder = self._path(identifier)
+        try:
+            document = read_document(folder)
+            if document["expires"] <= self._clock():
+                raise _unknown()
+            outcome = read_outcome(folder, document)
+        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+            raise _unknown() from None
+        return StoredResult(identifier, _moment(document["created"]), _moment(document["expires"]), outcome)
+
+    def delete(self, identifier: str) -> None:
+        """Forget a result; `UnknownResult` when it is not there or has expired."""
+        folder = self._path(identifier)
+        with self._lock:
+            expired = self._expiry(folder) <= self._clock()
+            if not self._remove(folder) or expired:
+                raise _unknown()
+
+    def sweep(self) -> int:
+        """Remove expired, damaged and half-written results; how many."""
+        now = self._clock()
+        with self._lock:
+            gone = [folder for folder in self._results() if self._expiry(folder) <= now]
+            for leftover in self._folder.glob(f"{_TEMPORARY}*"):
+                if _modified(leftover) < now - _ABANDONED_AFTER_S:
+                    shutil.rmtree(leftover, ignore_errors=True)
+            return sum(self._remove(folder) for folder in gone)
+
+    def _path(self, identifier: str) -> Path:
+        if not _IDENTIFIER.match(identifier):
+            raise _unknown()
+        return self._folder / identifier
+
+    def _results(self) -> Iterator[Path]:
+        return (folder for folder in self._folder.iterdir() if _IDENTIFIER.match(folder.name))
+
+    def _expiry(self, folder: Path) -> float:
+        try:
+            return float(read_document(folder)["expires"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return float("-inf")
+
+    def _make_room(self, needed: int) -> None:
+        if needed > self._max_bytes:
+            raise StoreFull("The result is larger than all results that this service may keep together.")
+        sizes = {folder: _size(folder) for folder in self._results()}
+        total = sum(sizes.values()) + needed
+        for folder in sorted(sizes, key=self._expiry):
+            if total <= self._max_bytes:
+                return
+            self._remove(folder)
+            total -= sizes[folder]
+
+    def _remove(self, folder: Path) -> bool:
+        grave = folder.with_name(f"{_TEMPORARY}{uuid.uuid4()}")
+        try:
+            folder.rename(grave)
+        except OSError:
+            return False
+        shutil.rmtree(grave, ignore_errors=True)
+        return True
+
+
+def _unknown() -> UnknownResult:
+    return UnknownResult("There is no reconstruction of this identifier; it may have expired or been deleted.")
+
+
+def _moment(seconds: float) -> datetime:
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def _size(folder: Path) -> int:
+    try:
+        return sum(file.stat().st_size for file in folder.iterdir())
+    except OSError:
+        return 0
+
+
+def _modified(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return float("inf")

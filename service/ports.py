@@ -1,0 +1,161 @@
+"""What the use cases need of the outside, as small protocols, and the domain types that cross them."""
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+from typing import Protocol, TypeVar
+
+import numpy as np
+from jaxtyping import Shaped
+
+from model.bundle import ShapeModel
+from model.geometry import Grid
+from model.inference.mesh import Mesh
+from model.inference.observations import MaskStack
+from model.inference.reconstruction import Options, Reconstruction
+
+T = TypeVar("T")
+
+
+class MeshFormat(StrEnum):
+    """Mesh formats of the interface; the value is also the file suffix."""
+
+    PLY = "ply"
+    STL = "stl"
+    OBJ = "obj"
+    GLB = "glb"
+    THREE_MF = "3mf"
+    VTP = "vtp"
+    MZ3 = "mz3"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A reconstruction with what is needed to evaluate it later.
+
+    Attributes:
+        model_name, model_version, model_digest: of the model that made it.
+        options: what the caller chose.
+        grid: voxel grid of the first mask, "the input's grid".
+        reconstruction: the answer.
+    """
+
+    model_name: str
+    model_version: str
+    model_digest: str
+    options: Options
+    grid: Grid
+    reconstruction: Reconstruction
+
+
+@dataclass(frozen=True)
+class StoredResult:
+    """An outcome in the store, with its random identifier and its time to live (UTC)."""
+
+    id: str
+    created: datetime
+    expires: datetime
+    outcome: Outcome
+
+
+class Catalogue(Protocol):
+    """The loaded models."""
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the loaded models, in order."""
+        ...
+
+    def get(self, name: str | None) -> ShapeModel:
+        """A model by name; the only one when `name` is None.
+
+        Raises:
+            UnknownModel: no model of that name.
+            InvalidParameter: no name, and not exactly one model.
+        """
+        ...
+
+
+class ResultStore(Protocol):
+    """Keeps outcomes for a limited time."""
+
+    def save(self, outcome: Outcome) -> StoredResult:
+        """Keep an outcome under a new random identifier.
+
+        Raises:
+            StoreFull: larger than everything that may be kept.
+        """
+        ...
+
+    def load(self, identifier: str) -> StoredResult:
+        """An outcome that has not expired.
+
+        Raises:
+            UnknownResult: never kept, expired or deleted.
+        """
+        ...
+
+    def delete(self, identifier: str) -> None:
+        """Forget an outcome at once.
+
+        Raises:
+            UnknownResult: never kept, expired or deleted.
+        """
+        ...
+
+
+class MaskReader(Protocol):
+    """Bytes of one file to a mask stack."""
+
+    def __call__(self, data: bytes, part: str, labels: tuple[int, ...] | None) -> MaskStack:
+        """Foreground are the voxels with one of the labels, all non-zero ones when None."""
+        ...
+
+
+class MeshWriter(Protocol):
+    """A mesh to the bytes of a file."""
+
+    def __call__(self, mesh: Mesh, format: str, *, space: str = "RAS", metadata: Mapping[str, object]) -> bytes:
+        """The same mesh gives the same bytes."""
+        ...
+
+
+class VolumeWriter(Protocol):
+    """A voxel array to the bytes of a NIfTI file."""
+
+    def __call__(self, array: Shaped[np.ndarray, "i j k"], grid: Grid, description: str) -> bytes:
+        """The same volume gives the same bytes."""
+        ...
+
+
+class Ticket(Protocol):
+    """The right to have work done."""
+
+    async def run(self, work: Callable[[], T]) -> T:
+        """Result of the work, done by one of the engine's workers."""
+        ...
+
+
+class WorkEngine(Protocol):
+    """Workers with a bounded queue before them."""
+
+    def admit(self) -> AbstractContextManager[Ticket]:
+        """A place among running and waiting work.
+
+        Raises:
+            Overloaded: all places are taken.
+        """
+        ...
+
+    def waiting(self) -> int:
+        """How many tickets wait for a worker."""
+        ...
+
+    def running(self) -> int:
+        """How many workers are busy."""
+        ...
+
+    def is_full(self) -> bool:
+        """Whether `admit` would refuse."""
+        ...

@@ -1,0 +1,413 @@
+"""Wire types of the HTTP interface; units stand in the names of the fields. They stop at the routes."""
+
+import json
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from fastapi import UploadFile
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from model.bundle import ShapeModel
+from model.errors import InvalidParameter
+from model.inference.observations import AnnotatedRule, Plane
+from model.inference.reconstruction import Estimate, Options
+from service.ports import MeshFormat, Outcome, StoredResult
+from service.use_cases import MAX_SEED, SURFACE_SD
+
+SpacingMm = Annotated[float, Field(ge=0.25, le=10.0, allow_inf_nan=False, description="grid step (mm)")]
+Seed = Annotated[int, Field(ge=0, le=MAX_SEED, description="makes the answer repeatable")]
+
+
+class SampleFormat(StrEnum):
+    """Formats of synthetic shapes: meshes, a label map, or arrays."""
+
+    STL = "stl"
+    PLY = "ply"
+    OBJ = "obj"
+    GLB = "glb"
+    THREE_MF = "3mf"
+    VTP = "vtp"
+    MZ3 = "mz3"
+    NIFTI = "nifti"
+    NPZ = "npz"
+
+
+class _Closed(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class ReconstructionForm(_Closed):
+    """The parts of a reconstruction request."""
+
+    mask: list[UploadFile] = Field(
+        min_length=1,
+        description="sparse segmentation (NIfTI, NRRD, seg.nrrd or MetaImage); several files are several stacks of "
+        "the same object, each with its own grid; the first one's grid is the input's grid",
+    )
+    model: str | None = Field(None, description="model name; may be left out when only one is loaded")
+    label: list[str] = Field(
+        default_factory=list,
+        description="label value or values of the object, repeated or separated by commas; all non-zero when left out",
+    )
+    annotated: str = Field(
+        "auto",
+        description='auto, all, nonempty, or a JSON list of planes such as [{"stack": 0, "axis": 2, "index": 7}]',
+    )
+    uncertainty: Literal["laplace", "ensemble", "none"] = Field("laplace", description="how uncertainty is found")
+    mirror: Literal["auto", "never", "always"] = Field("never", description="whether left and right are exchanged")
+    resolution_mm: SpacingMm | None = Field(None, description="grid step of the surface (mm); the model's when left out")
+    seed: Seed = 0
+
+    def options(self) -> Options:
+        """The choices as domain types."""
+        annotated = parse_annotated(self.annotated)
+        return Options(annotated, self.uncertainty, self.mirror, self.resolution_mm, self.seed)
+
+
+class MeshQuery(_Closed):
+    """Query of a mesh."""
+
+    format: MeshFormat = Field(MeshFormat.PLY, description="file format")
+
+
+class VolumeQuery(_Closed):
+    """Query of a volume."""
+
+    spacing_mm: SpacingMm | None = Field(None, description="grid step (mm); the input's grid when left out")
+
+
+class UncertaintyQuery(VolumeQuery):
+    """Query of an uncertainty."""
+
+    kind: Literal["entropy", "surface_sd"] = Field(
+        "entropy", description="voxel entropy (nats, NIfTI) or standard deviation of the surface (mm, JSON)"
+    )
+
+
+class SampleQuery(_Closed):
+    """Query of one synthetic shape."""
+
+    format: SampleFormat = Field(SampleFormat.STL, description="file format")
+    temperature: float = Field(
+        1.0, gt=0.0, le=2.0, allow_inf_nan=False, description="spread of the shapes; 1 is the population's"
+    )
+    spacing_mm: SpacingMm | None = Field(None, description="grid step (mm); the model's when left out")
+
+
+class BatchQuery(SampleQuery):
+    """Query of a batch of synthetic shapes."""
+
+    count: int = Field(16, ge=1, description="how many; larger than the service's limit is refused with 413")
+    seed: Seed = 0
+
+
+class PlaneSchema(_Closed):
+    """A plane of voxels."""
+
+    stack: int = Field(ge=0, description="number of the mask part")
+    axis: int = Field(ge=0, le=2, description="voxel axis that the plane is perpendicular to")
+    index: int = Field(ge=0, description="voxel index along the axis")
+
+
+class EstimateSchema(BaseModel):
+    """A figure with its 90 % interval; the ends are null without uncertainty."""
+
+    value: float
+    low: float | None
+    high: float | None
+
+    @classmethod
+    def of(cls, estimate: Estimate) -> "EstimateSchema":
+        """From the domain type."""
+        return cls(value=estimate.value, low=estimate.low, high=estimate.high)
+
+
+class ModelReference(BaseModel):
+    """Which model made a result."""
+
+    name: str
+    version: str
+    digest: str = Field(description="SHA-256 of the bundle")
+
+
+class FitSchema(BaseModel):
+    """How the fit ended."""
+
+    status: Literal["converged", "stalled", "iteration_limit"]
+    converged: bool
+    message: str
+    iterations: int
+
+
+class PoseSchema(BaseModel):
+    """Where the shape lies in the world: canonical = scale * rotation * flip * (world - position)."""
+
+    position_mm: list[float] = Field(description="the model's origin in the world")
+    rotation: list[list[float]] = Field(description="3 x 3, by rows")
+    scale: float
+    mirrored: bool
+
+
+class SurfaceSdSummary(BaseModel):
+    """Standard deviation of the surface along its normal (mm)."""
+
+    mean_mm: float
+    max_mm: float
+
+
+class ResidualSchema(BaseModel):
+    """How far a drawn plane and the reconstruction disagree."""
+
+    plane: PlaneSchema
+    disagreement: float = Field(description="share of the plane's weight on the wrong side of the surface, 0 to 1")
+    mean_error: float = Field(description="mean of label minus probability")
+
+
+class Links(BaseModel):
+    """Where the parts of a result are."""
+
+    self: str
+    mesh: str
+    segmentation: str
+    occupancy: str
+    uncertainty: str | None = Field(description="null when uncertainty was not asked for")
+    surface_sd: str | None = Field(description="null when uncertainty was not asked for")
+
+
+class Summary(BaseModel):
+    """What a reconstruction found; coordinates are RAS in mm."""
+
+    model: ModelReference
+    space: Literal["RAS"] = "RAS"
+    unit: Literal["mm"] = "mm"
+    fit: FitSchema
+    pose: PoseSchema
+    uncertainty: Literal["laplace", "ensemble", "none"]
+    seed: int
+    observations: int = Field(description="number of point observations")
+    planes: list[PlaneSchema] = Field(description="the annotated planes that were used")
+    residuals: list[ResidualSchema]
+    volume_ml: EstimateSchema
+    area_cm2: EstimateSchema
+    surface_sd: SurfaceSdSummary | None
+    log_prior_density_nats: float
+    typicality_percentile: float = Field(description="share of the training population with a lower density, 0 to 100")
+    warnings: list[str]
+
+
+class ResultSummary(Summary):
+    """A reconstruction that is kept."""
+
+    id: str
+    created: datetime
+    expires: datetime
+    links: Links
+
+
+class SurfaceSd(BaseModel):
+    """Standard deviation of the surface at each vertex, in the order of the mesh in PLY."""
+
+    space: Literal["RAS"] = "RAS"
+    unit: Literal["mm"] = "mm"
+    surface_sd_mm: list[float]
+
+
+class ModelSummary(BaseModel):
+    """A loaded model in short."""
+
+    name: str
+    version: str
+    structure: str
+    digest: str = Field(description="SHA-256 of the bundle")
+    link: str
+
+
+class ModelList(BaseModel):
+    """The loaded models."""
+
+    models: list[ModelSummary]
+
+
+class ActiveDimensions(BaseModel):
+    """How many latent dimensions explain so much of the variance."""
+
+    percent_95: int
+    percent_97: int
+    percent_99: int
+
+
+class ModelDescription(ModelSummary):
+    """Everything a model says about itself."""
+
+    frame: str
+    unit: str
+    side: str
+    latent_size: int
+    active_dimensions: ActiveDimensions
+    half_extent_mm: list[float]
+    resolution_mm: float
+    training: dict[str, object]
+    training_shapes: int
+    licence: str
+    attribution: str
+    accuracy: dict[str, dict[str, float]]
+
+
+class Health(BaseModel):
+    """The process answers."""
+
+    status: Literal["ok"] = "ok"
+
+
+class BrokenModelSchema(BaseModel):
+    """A model that could not be loaded."""
+
+    name: str
+    reason: str
+
+
+class Readiness(BaseModel):
+    """What the service can do now."""
+
+    status: Literal["ready"] = "ready"
+    models: list[str]
+    broken: list[BrokenModelSchema]
+
+
+class Problem(BaseModel):
+    """What went wrong (RFC 9457)."""
+
+    type: str = Field(description="stable name of the kind of problem")
+    title: str
+    status: int
+    detail: str = Field(description="a sentence that names the offending part and what would be accepted")
+    part: str | None = Field(None, description="the offending part, for example mask[1] or resolution_mm")
+    request_id: str | None = Field(None, description="the request in the service's logs")
+
+
+def parse_annotated(text: str) -> AnnotatedRule | tuple[Plane, ...]:
+    """The `annotated` parameter.
+
+    Raises:
+        InvalidParameter: neither a rule nor a JSON list of planes.
+    """
+    match text.strip():
+        case "auto" | "all" | "nonempty" as rule:
+            return rule  # type: ignore[return-value]
+    try:
+        planes = [PlaneSchema.model_validate(item, strict=True) for item in json.loads(text)]
+    except (ValueError, TypeError, RecursionError, ValidationError):
+        planes = []
+    if not planes:
+        accepted = 'auto, all, nonempty or a JSON list of planes such as [{"stack": 0, "axis": 2, "index": 7}]'
+        raise InvalidParameter(f"The parameter annotated must be {accepted}.", part="annotated")
+    return tuple(Plane(plane.stack, plane.axis, plane.index) for plane in planes)
+
+
+def parse_labels(texts: list[str]) -> tuple[int, ...] | None:
+    """The `label` parameter: repeated, separated by commas, or not there.
+
+    Raises:
+        InvalidParameter: not whole numbers from 1 to 65535.
+    """
+    words = [word.strip() for text in texts for word in text.split(",") if text.strip()]
+    if not words:
+        return None
+    if not all(word.isascii() and word.isdecimal() and len(word) <= 5 and 1 <= int(word) <= 65535 for word in words):
+        raise InvalidParameter("The parameter label must be whole numbers from 1 to 65535.", part="label")
+    return tuple(dict.fromkeys(map(int, words)))
+
+
+def summary_of(outcome: Outcome) -> Summary:
+    """The wire form of an outcome."""
+    answer = outcome.reconstruction
+    fit = answer.state.fits[0]
+    pose = fit.pose
+    sd = answer.mesh.scalars.get(SURFACE_SD)
+    return Summary(
+        model=ModelReference(name=outcome.model_name, version=outcome.model_version, digest=outcome.model_digest),
+        fit=FitSchema(
+            status=fit.status.value,
+            converged=fit.status.value == "converged",
+            message=fit.message,
+            iterations=fit.iterations,
+        ),
+        pose=PoseSchema(
+            position_mm=pose.position.tolist(),
+            rotation=pose.rotation.tolist(),
+            scale=float(2.718281828459045**pose.log_scale),
+            mirrored=pose.mirrored,
+        ),
+        uncertainty=outcome.options.uncertainty,
+        seed=outcome.options.seed,
+        observations=answer.observation_count,
+        planes=[_plane(plane) for plane in answer.planes],
+        residuals=[
+            ResidualSchema(plane=_plane(r.plane), disagreement=r.disagreement, mean_error=r.mean_error)
+            for r in answer.residuals
+        ],
+        volume_ml=EstimateSchema.of(answer.volume_ml),
+        area_cm2=EstimateSchema.of(answer.area_cm2),
+        surface_sd=None if sd is None else SurfaceSdSummary(mean_mm=float(sd.mean()), max_mm=float(sd.max())),
+        log_prior_density_nats=answer.log_prior_density,
+        typicality_percentile=answer.typicality_percentile,
+        warnings=list(answer.warnings),
+    )
+
+
+def result_summary(result: StoredResult, address: str) -> ResultSummary:
+    """The wire form of a kept result that stands at an address."""
+    uncertain = SURFACE_SD in result.outcome.reconstruction.mesh.scalars
+    links = Links(
+        self=address,
+        mesh=f"{address}/mesh",
+        segmentation=f"{address}/segmentation",
+        occupancy=f"{address}/occupancy",
+        uncertainty=f"{address}/uncertainty" if uncertain else None,
+        surface_sd=f"{address}/uncertainty?kind=surface_sd" if uncertain else None,
+    )
+    return ResultSummary(
+        id=result.id,
+        created=result.created,
+        expires=result.expires,
+        links=links,
+        **summary_of(result.outcome).model_dump(),
+    )
+
+
+def model_summary(model: ShapeModel, address: str) -> ModelSummary:
+    """The wire form of a model in short."""
+    manifest = model.manifest
+    return ModelSummary(
+        name=manifest.name,
+        version=manifest.version,
+        structure=manifest.structure,
+        digest=model.digest,
+        link=address,
+    )
+
+
+def model_description(model: ShapeModel, address: str) -> ModelDescription:
+    """The wire form of everything a model says about itself."""
+    manifest = model.manifest
+    low, middle, high = manifest.active_dimensions
+    return ModelDescription(
+        **model_summary(model, address).model_dump(),
+        frame=manifest.frame,
+        unit=manifest.units,
+        side=manifest.side,
+        latent_size=manifest.latent_size,
+        active_dimensions=ActiveDimensions(percent_95=low, percent_97=middle, percent_99=high),
+        half_extent_mm=list(manifest.half_extent_mm),
+        resolution_mm=manifest.resolution_mm,
+        training=manifest.training,
+        training_shapes=len(model.population.codes),
+        licence=manifest.licence,
+        attribution=manifest.attribution,
+        accuracy=manifest.accuracy,
+    )
+
+
+def _plane(plane: Plane) -> PlaneSchema:
+    return PlaneSchema(stack=plane.stack, axis=plane.axis, index=plane.index)

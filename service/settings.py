@@ -1,0 +1,134 @@
+"""Settings of the service: environment variables ``MORPHOFLOW_*`` and an optional TOML file.
+
+Nothing is read at import; `load_settings` reads the environment once, when a program starts.
+"""
+
+import ipaddress
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, SecretStr, ValidationError, field_validator
+from pydantic_settings import (
+    BaseSettings,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    TomlConfigSettingsSource,
+)
+
+from model.errors import InvalidParameter
+
+#: Names a TOML file with settings; the environment overrides it.
+SETTINGS_FILE_VARIABLE = "MORPHOFLOW_SETTINGS_FILE"
+
+
+def default_results_folder() -> Path:
+    """Where results are kept unless a setting says otherwise: the user's state folder."""
+    return Path.home() / ".local" / "state" / "morphoflow" / "results"
+
+
+class Settings(BaseSettings):
+    """All settings; each field is the environment variable ``MORPHOFLOW_<FIELD>``."""
+
+    model_config = SettingsConfigDict(env_prefix="MORPHOFLOW_", extra="forbid", frozen=True)
+
+    host: str = Field("127.0.0.1", description="address to listen on")
+    port: int = Field(8000, ge=1, le=65535, description="port to listen on")
+    root_path: str = Field("", description="path prefix that a reverse proxy strips")
+    models: Annotated[tuple[Path, ...], NoDecode] = Field(
+        (), description="folders with further models, separated as in PATH; each a bundle or a folder of bundles"
+    )
+    shipped_models: bool = Field(True, description="whether the models that ship with the program are loaded")
+    backend: Literal["onnx", "torchscript"] = Field("onnx", description="what evaluates the networks")
+    threads: int | None = Field(None, ge=1, le=256, description="threads of one evaluation; the backend decides if unset")
+    api_keys: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
+        (), description="accepted keys, separated by commas; a key is asked for as soon as one is set"
+    )
+    allow_open: bool = Field(False, description="allow to listen on a public address without a key")
+    results_folder: Path = Field(default_factory=default_results_folder, description="where results are kept")
+    result_lifetime_s: float = Field(86400.0, gt=0, description="how long a result is served")
+    results_max_bytes: int = Field(10 * 2**30, ge=1, description="results kept together; the oldest go first")
+    sweep_interval_s: float = Field(60.0, gt=0, description="how often expired results are removed")
+    max_body_bytes: int = Field(256 * 2**20, ge=1, description="largest request body")
+    max_voxels: int = Field(2**27, ge=1, description="most voxels of a mask after decompression, and of an answer")
+    max_masks: int = Field(8, ge=1, description="most mask parts of a request")
+    max_samples: int = Field(256, ge=1, description="most shapes of a batch")
+    workers: int = Field(2, ge=1, le=256, description="reconstructions and samples computed at the same time")
+    max_waiting: int = Field(8, ge=0, description="requests that may wait for a worker")
+    retry_after_s: int = Field(10, ge=1, description="when a refused client is told to come back")
+    log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="least severe entry logged")
+
+    @field_validator("models", mode="before")
+    @classmethod
+    def _split_paths(cls, value: object) -> object:
+        return tuple(filter(None, value.split(os.pathsep))) if isinstance(value, str) else value
+
+    @field_validator("api_keys", mode="before")
+    @classmethod
+    def _split_keys(cls, value: object) -> object:
+        return tuple(filter(None, map(str.strip, value.split(",")))) if isinstance(value, str) else value
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Arguments, then the environment, then the settings file."""
+        file = os.environ.get(SETTINGS_FILE_VARIABLE)
+        toml = (TomlConfigSettingsSource(settings_cls, Path(file)),) if file else ()
+        return (init_settings, env_settings, *toml)
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The accepted keys in clear."""
+        return tuple(key.get_secret_value() for key in self.api_keys)
+
+
+def load_settings(overrides: Mapping[str, Any] | None = None) -> Settings:
+    """Read the settings.
+
+    Raises:
+        InvalidParameter: a value is out of its range, a key is unknown, or the file cannot be read.
+    """
+    file = os.environ.get(SETTINGS_FILE_VARIABLE)
+    if file and not Path(file).is_file():
+        raise InvalidParameter(f"{SETTINGS_FILE_VARIABLE} must name a readable TOML file.", part=SETTINGS_FILE_VARIABLE)
+    try:
+        return Settings(**(overrides or {}))
+    except ValidationError as fault:
+        first = fault.errors(include_input=False)[0]
+        name = ".".join(map(str, first["loc"])) or "settings"
+        raise InvalidParameter(f"The setting {name} is not valid: {first['msg']}.", part=name) from None
+    except ValueError:
+        raise InvalidParameter(f"{SETTINGS_FILE_VARIABLE} must hold valid TOML.", part=SETTINGS_FILE_VARIABLE) from None
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only programs on the same machine can reach an address."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def require_protection(settings: Settings) -> None:
+    """Refuse to listen on a public address without a key.
+
+    Raises:
+        InvalidParameter: the address is public, no key is set and nobody allowed that.
+    """
+    if settings.keys or settings.allow_open or is_loopback(settings.host):
+        return
+    raise InvalidParameter(
+        f"Listening on {settings.host} without a key would open the service to the network: "
+        "set MORPHOFLOW_API_KEYS, listen on 127.0.0.1, or allow it with MORPHOFLOW_ALLOW_OPEN=true.",
+        part="host",
+    )

@@ -1,0 +1,158 @@
+"""What the service can do, as plain functions of domain types: no HTTP, no settings, no clock."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from model.bundle import ShapeModel
+from model.errors import InvalidParameter, TooLarge
+from model.geometry import Grid, Pose
+from model.inference.fitting import Fit, FitStatus
+from model.inference.observations import MaskStack
+from model.inference.reconstruction import (
+    Options,
+    ShapeState,
+    Watch,
+    covering_grid,
+    occupancy,
+    voxel_entropy,
+)
+from model.inference.reconstruction import reconstruct as infer
+from model.inference.sampling import SampledShape, draw_shape
+from service.errors import NotComputed
+from service.ports import Catalogue, Outcome, ResultStore, StoredResult
+
+#: A voxel belongs to the object from this probability on.
+OCCUPIED = 0.5
+#: Scalar of a mesh that holds the standard deviation of its surface along the normal (mm).
+SURFACE_SD = "surface_sd_mm"
+#: Largest seed; exact as a JSON number everywhere.
+MAX_SEED = 2**53 - 1
+
+
+def reconstruct(model: ShapeModel, stacks: tuple[MaskStack, ...], options: Options, watch: Watch) -> Outcome:
+    """Reconstruct the object of the stacks; the first one's grid is the input's grid.
+
+    Raises:
+        InputError: the stacks or options cannot be used; the sentence says why.
+    """
+    reconstruction = infer(model, stacks, options, watch)
+    manifest = model.manifest
+    return Outcome(manifest.name, manifest.version, model.digest, options, stacks[0].grid, reconstruction)
+
+
+def keep(store: ResultStore, outcome: Outcome) -> StoredResult:
+    """Keep an outcome for later requests."""
+    return store.save(outcome)
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A voxel array on its grid."""
+
+    array: Float[np.ndarray, "i j k"] | UInt8[np.ndarray, "i j k"]
+    grid: Grid
+
+
+def probability_map(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int) -> Volume:
+    """Occupancy probability on the input's grid, or on a grid around the surface at a spacing (mm).
+
+    Raises:
+        NotComputed: the model that made the outcome is no longer loaded.
+        TooLarge: the grid has more voxels than allowed.
+    """
+    model = _same_model(catalogue, outcome)
+    mesh = outcome.reconstruction.mesh
+    grid = outcome.grid if spacing_mm is None else covering_grid(mesh, spacing_mm)
+    require_voxels(grid, max_voxels)
+    return Volume(occupancy(model, outcome.reconstruction.state, grid), grid)
+
+
+def segmentation(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int) -> Volume:
+    """Label map, 1 where the object is more likely than not; grid and errors as in `probability_map`."""
+    volume = probability_map(catalogue, outcome, spacing_mm, max_voxels)
+    return Volume((volume.array >= OCCUPIED).astype(np.uint8), volume.grid)
+
+
+def entropy_map(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int) -> Volume:
+    """Voxel entropy (nats); grid and errors as in `probability_map`, and `NotComputed` without uncertainty."""
+    _require_uncertainty(outcome)
+    volume = probability_map(catalogue, outcome, spacing_mm, max_voxels)
+    return Volume(voxel_entropy(volume.array), volume.grid)
+
+
+def surface_sd(outcome: Outcome) -> Float[np.ndarray, "v"]:
+    """Standard deviation (mm) of the surface at each vertex; `NotComputed` without uncertainty."""
+    _require_uncertainty(outcome)
+    return outcome.reconstruction.mesh.scalars[SURFACE_SD]
+
+
+def draw(model: ShapeModel, seed: int, temperature: float, spacing_mm: float | None, max_voxels: int) -> SampledShape:
+    """One synthetic shape.
+
+    Raises:
+        InvalidParameter: temperature or spacing out of its range.
+        TooLarge: the evaluated grid would have more voxels than allowed.
+    """
+    step = model.manifest.resolution_mm if spacing_mm is None else spacing_mm
+    if step > 0 and np.prod([np.ceil(2 * half / step) + 1 for half in model.manifest.half_extent_mm]) > max_voxels:
+        raise _too_many_voxels(max_voxels)
+    return draw_shape(model, seed, temperature=temperature, spacing_mm=spacing_mm)
+
+
+def batch_seeds(seed: int, count: int, max_count: int) -> range:
+    """Seeds of a batch: item i has seed + i.
+
+    Raises:
+        TooLarge: more shapes than allowed.
+        InvalidParameter: no shape at all, or a seed beyond the largest one.
+    """
+    if count < 1:
+        raise InvalidParameter("The parameter count must be 1 or more.", part="count")
+    if count > max_count:
+        raise TooLarge(f"The parameter count must not be larger than {max_count}.", part="count")
+    if not 0 <= seed <= MAX_SEED - count + 1:
+        raise InvalidParameter(f"The seeds of a batch must lie between 0 and {MAX_SEED}.", part="seed")
+    return range(seed, seed + count)
+
+
+def label_map(model: ShapeModel, shape: SampledShape, spacing_mm: float, max_voxels: int) -> Volume:
+    """A synthetic shape as a label map in the model's canonical frame."""
+    grid = covering_grid(shape.mesh, spacing_mm)
+    require_voxels(grid, max_voxels)
+    size = len(shape.latent) + 7
+    fit = Fit(shape.latent, Pose(), FitStatus.CONVERGED, "Drawn, not fitted.", 0, 0.0, np.zeros((size, size)))
+    probability = occupancy(model, ShapeState((fit,), None), grid)
+    return Volume((probability >= OCCUPIED).astype(np.uint8), grid)
+
+
+def describe(catalogue: Catalogue) -> Iterator[ShapeModel]:
+    """The loaded models in order."""
+    return (catalogue.get(name) for name in catalogue.names())
+
+
+def require_voxels(grid: Grid, max_voxels: int) -> None:
+    """Refuse a grid with more voxels than allowed, before anything of its size is made."""
+    if np.prod([float(count) for count in grid.shape]) > max_voxels:
+        raise _too_many_voxels(max_voxels)
+
+
+def _too_many_voxels(max_voxels: int) -> TooLarge:
+    return TooLarge(
+        f"The parameter spacing_mm asks for more than {max_voxels} voxels; ask for a coarser one.", part="spacing_mm"
+    )
+
+
+def _same_model(catalogue: Catalogue, outcome: Outcome) -> ShapeModel:
+    if outcome.model_name in catalogue.names():
+        model = catalogue.get(outcome.model_name)
+        if model.digest == outcome.model_digest:
+            return model
+    raise NotComputed("The model that made this reconstruction is no longer loaded; its summary and mesh are.")
+
+
+def _require_uncertainty(outcome: Outcome) -> None:
+    if SURFACE_SD not in outcome.reconstruction.mesh.scalars:
+        raise NotComputed("This reconstruction was made without uncertainty; ask for laplace or ensemble.")
