@@ -42,7 +42,7 @@ class Ellipsoid:
 
     def logits(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Positive inside, slope at most one a mm: ``min(a, b, c) (1 - |q|)``, q in units of the axes."""
-        return min(self.semi_axes) * (1.0 - np.linalg.norm(self._unit(points), axis=1))
+        return np.asarray(min(self.semi_axes) * (1.0 - np.linalg.norm(self._unit(points), axis=1)))
 
     def logits_and_gradients(
         self, points: Float[np.ndarray, "n 3"]
@@ -55,10 +55,15 @@ class Ellipsoid:
 
     def mask(self, grid: Grid) -> Bool[np.ndarray, "i j k"]:
         """Voxels whose centre lies inside."""
-        return (self.logits(grid.centres()) > 0).reshape(grid.shape)
+        return (self.logits(voxel_centres(grid)) > 0).reshape(grid.shape)
 
     def _unit(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        return (points - self.centre) @ self.rotation / np.array(self.semi_axes)
+        return np.asarray((points - self.centre) @ self.rotation / np.array(self.semi_axes))
+
+
+def voxel_centres(grid: Grid) -> Float[np.ndarray, "n 3"]:
+    """World positions of all voxel centres, last index fastest."""
+    return grid.to_world(np.argwhere(np.ones(grid.shape, bool)).astype(float))
 
 
 def sphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Ellipsoid:

@@ -9,6 +9,7 @@ a Newton step along the gradient when there is one.
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,6 +27,10 @@ FieldWithGradient = Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray,
 #: Node values this close to zero, in shares of the typical value beside the surface, count as that
 #: far away: a vertex exactly on a node would make degenerate faces.
 NODE_CLEARANCE = 1e-3
+#: How far from a cell's corners the surface is looked for without a sign change, in cell sizes: on the
+#: coarsest level everywhere (half a diagonal), later only as far as spares a round of following the surface.
+COARSE_REACH = 3**0.5 / 2
+FINE_REACH = 0.3
 
 
 class Refinement:
@@ -33,9 +38,10 @@ class Refinement:
 
     Starts with every ``coarse_factor``-th node. Each level halves the step in the cells that hold a
     sign change, in their neighbours on the coarsest level, and in those whose values are so small,
-    compared with the slopes around them, that the surface could pass between the corners. When the
-    finer nodes on the border of the refined region show a sign change, the cells beyond are refined
-    too, until the surface is closed. Other nodes are interpolated, which keeps their sign.
+    compared with the slopes around them, that the surface could pass between the corners, as it does
+    where a part is thinner than a cell. When the finer nodes on the border of the refined region show
+    a sign change, the cells beyond are refined too, until the surface is closed. Other nodes are
+    interpolated, which keeps their sign.
 
     Args:
         lower, upper: corners of the box (mm).
@@ -51,7 +57,7 @@ class Refinement:
         self._step = step_mm
         self._cells = np.maximum(np.ceil((np.asarray(upper, float) - lower) / step_mm - 1e-6), 1).astype(int)
         self._stride = coarse_factor
-        self._values = np.zeros(-(-self._cells // coarse_factor) + 1, np.float32)
+        self._values: Float[np.ndarray, "i j k"] = np.zeros(-(-self._cells // coarse_factor) + 1, np.float32)
         self._known = np.zeros(self._values.shape, bool)
         self._pending = ~self._known
         self._refined: Bool[np.ndarray, "a b c"] | None = None
@@ -60,7 +66,7 @@ class Refinement:
 
     def query(self) -> Float[np.ndarray, "n 3"]:
         """The points (mm) whose values are wanted next; none when the grid is complete."""
-        return self._origin + np.argwhere(self._pending) * (self._step * self._stride)
+        return np.asarray(self._origin + np.argwhere(self._pending) * (self._step * self._stride))
 
     def update(self, values: Float[np.ndarray, "n"]) -> None:
         """Take the values at the points of the last `query`."""
@@ -85,16 +91,16 @@ class Refinement:
             return np.zeros_like(self._known)
         self._floods += 1
         if self._floods > 1:
-            beyond = ndimage.binary_dilation(beyond, np.ones((3, 3, 3)))
+            beyond = ndimage.binary_dilation(beyond, np.ones((3, 3, 3), bool))
         self._refined |= beyond
         return _nodes_of(beyond) & ~self._known
 
     def _refine(self) -> None:
         """Halve the step."""
-        cells = _mixed(self._values > 0, 1)
+        cells, reach = _mixed(self._values > 0, 1), FINE_REACH
         if self._refined is None:
-            cells = ndimage.binary_dilation(cells, np.ones((3, 3, 3)))
-        self._refined = cells | _within_reach(self._values)
+            cells, reach = ndimage.binary_dilation(cells, np.ones((3, 3, 3), bool)), COARSE_REACH
+        self._refined = cells | _within_reach(self._values, reach)
         self._stride //= 2
         self._floods = 0
         self._values = _prolonged(self._values)
@@ -162,7 +168,8 @@ def polygonise(values: Float[np.ndarray, "i j k"], lower: Float[np.ndarray, "3"]
     for axis in range(3):
         border = np.moveaxis(padded, axis, 0)
         border[[0, -1]] = -np.abs(border[[0, -1]])
-    corners, faces, _, _ = measure.marching_cubes(padded, 0.0, method="lewiner", gradient_direction="ascent")
+    marching_cubes: Any = measure.marching_cubes
+    corners, faces, _, _ = marching_cubes(padded, 0.0, method="lewiner", gradient_direction="ascent")
     vertices = np.asarray(lower, float) + (corners.astype(float) + first - 1) * step_mm
     return mesh_of(vertices, faces.astype(np.int64))
 
@@ -197,8 +204,7 @@ def _mixed(inside: Bool[np.ndarray, "i j k"], span: int) -> Bool[np.ndarray, "a 
     """Cells of `span` node intervals along each axis whose nodes are not all on one side."""
     some = every = inside
     for axis in range(3):
-        some = _pooled(some, axis, span, np.logical_or)
-        every = _pooled(every, axis, span, np.logical_and)
+        some, every = _pooled(some, axis, span, np.logical_or), _pooled(every, axis, span, np.logical_and)
     return np.asarray(some & ~every)
 
 
@@ -234,11 +240,8 @@ def _prolonged(values: Float[np.ndarray, "i j k"]) -> Float[np.ndarray, "a b c"]
     return np.ascontiguousarray(values)
 
 
-def _within_reach(values: Float[np.ndarray, "i j k"]) -> Bool[np.ndarray, "a b c"]:
-    """Cells with a corner so close to zero that slopes like those around it could bring the surface in.
-
-    The furthest place of a cell is half a diagonal from its nearest corner.
-    """
+def _within_reach(values: Float[np.ndarray, "i j k"], reach: float) -> Bool[np.ndarray, "a b c"]:
+    """Cells with a corner so close to zero that, with slopes like those around, the surface is within `reach`."""
     squared = np.zeros([n - 1 for n in values.shape], np.float32)
     for axis in range(3):
         slope = np.diff(values, axis=axis)
@@ -249,7 +252,7 @@ def _within_reach(values: Float[np.ndarray, "i j k"]) -> Bool[np.ndarray, "a b c
     nearest = np.abs(values)
     for axis in range(3):
         nearest = _pooled(nearest, axis, 1, np.minimum)
-    return np.asarray(nearest**2 <= 0.75 * ndimage.maximum_filter(squared, 3))
+    return np.asarray(nearest**2 <= reach**2 * ndimage.maximum_filter(squared, 3))
 
 
 def _bounds(inside: Bool[np.ndarray, "i j k"]) -> tuple[np.ndarray, np.ndarray]:

@@ -62,20 +62,20 @@ def area_cm2(mesh: Mesh) -> float:
 def vertex_areas(mesh: Mesh) -> Float[np.ndarray, "v"]:
     """Area that each vertex stands for: a third of its faces' (mm^2); the sum is the surface area."""
     third = np.linalg.norm(_area_vectors(mesh.vertices, mesh.faces), axis=1) / 3.0
-    return np.bincount(mesh.faces.ravel(), np.repeat(third, 3), minlength=len(mesh.vertices))
+    return np.bincount(mesh.faces.ravel(), np.repeat(third, 3), minlength=len(mesh.vertices)).astype(float)
 
 
 def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
     """Unit normals, faces weighted by area; a vertex without area gets the zero vector."""
     weighted = np.repeat(_area_vectors(vertices, faces), 3, axis=0)
     total = [np.bincount(faces.ravel(), weighted[:, axis], minlength=len(vertices)) for axis in range(3)]
-    return unit(np.stack(total, axis=1))
+    return unit(np.stack(total, axis=1).astype(float))
 
 
 def unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Vectors scaled to length one; those of length zero stay zero."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0))
 
 
 def is_watertight(mesh: Mesh) -> bool:
