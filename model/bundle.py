@@ -26,7 +26,7 @@ class Manifest:
         active_dimensions: how many sigmas explain 95, 97 and 99 % of the base variance.
         half_extent_mm: half size of the canonical box that holds every training shape.
         resolution_mm: default grid step of the surface.
-        likelihood_temperature: calibrated on validation shapes.
+        likelihood_precision: information of one mm^2 of annotated plane, 1/mm^2; calibrated on validation shapes.
         training: cohort, cases, regime, command and so on.
         licence, attribution: of the weights.
         accuracy: measured figures by regime, for example ``{"thin": {"dice": 0.87, "asd_mm": 0.34}}``.
@@ -44,7 +44,7 @@ class Manifest:
     active_dimensions: tuple[int, int, int]
     half_extent_mm: tuple[float, float, float]
     resolution_mm: float
-    likelihood_temperature: float
+    likelihood_precision: float
     training: dict[str, object]
     licence: str
     attribution: str

@@ -69,8 +69,12 @@ class LatentPrior(nn.Module):
     def log_density(self, latent: Float[Tensor, "b d"]) -> Float[Tensor, "b"]:
         """``log p(z)`` in nats (change of variables)."""
         base, log_det = self.to_base(latent)
+        return self.base_log_density(base) + log_det
+
+    def base_log_density(self, base: Float[Tensor, "b d"]) -> Float[Tensor, "b"]:
+        """``log N(z0; 0, diag(sigma^2))`` in nats."""
         gaussian = -0.5 * (base / self.sigma).square() - self.log_sigma - 0.5 * math.log(2 * math.pi)
-        return gaussian.sum(dim=-1) + log_det
+        return gaussian.sum(dim=-1)
 
     def ard_loss(self, a: float, b: float) -> Float[Tensor, ""]:
         """``sum_i -(a - 1) log alpha_i + b alpha_i`` with ``alpha_i = exp(-2 log sigma_i)``."""
