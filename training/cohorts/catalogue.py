@@ -1,0 +1,50 @@
+"""The named cohorts and where their masks lie."""
+
+from enum import StrEnum
+from pathlib import Path
+
+from model.errors import CohortError
+from training.cohorts import adrenal, femur, hippocampus, talus, vertebra
+from training.cohorts.assemble import CohortOptions
+from training.cohorts.cohort import Cohort
+
+
+class CohortName(StrEnum):
+    """Public data sets with a module of their own."""
+
+    HIPPOCAMPUS = "hippocampus"
+    ADRENAL = "adrenal"
+    TALUS = "talus"
+    VERTEBRA = "vertebra"
+    FEMUR = "femur"
+
+
+def load_cohort(name: CohortName, root: Path, options: CohortOptions) -> Cohort:
+    """A named cohort below a data folder, which holds one folder a cohort.
+
+    Raises:
+        CohortError: not there, or not fit to be used.
+    """
+    match name:
+        case CohortName.HIPPOCAMPUS:
+            return hippocampus.load(root, options)
+        case CohortName.ADRENAL:
+            return adrenal.load(root, options)
+        case CohortName.TALUS:
+            return talus.load(root, options)
+        case CohortName.VERTEBRA:
+            return vertebra.load(root, options)
+        case CohortName.FEMUR:
+            return femur.load(root, options)
+
+
+def data_folder(named: Path | None) -> Path:
+    """The data folder that was named, or ``../shared/data`` beside the working folder.
+
+    Raises:
+        CohortError: there is none.
+    """
+    folder = named if named is not None else Path("../shared/data")
+    if not folder.is_dir():
+        raise CohortError("The data folder does not exist; name one with --data or MORPHOFLOW_DATA.")
+    return folder

@@ -1,0 +1,135 @@
+"""A cohort: masks of one structure, split by person, with what was found on looking at them."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool
+
+from model.errors import CohortError
+from model.geometry import Grid
+
+Split = Literal["train", "validation", "test"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One mask.
+
+    Attributes:
+        name: unique within the cohort.
+        person: cases of one person are never divided between splits.
+        split: train, validation or test.
+        mask: (i, j, k) voxels of the object.
+        grid: its voxels in the world (RAS mm).
+        findings: peculiarities that were seen and let pass, as sentences.
+    """
+
+    name: str
+    person: str
+    split: Split
+    mask: Bool[np.ndarray, "i j k"]
+    grid: Grid
+    findings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A case that is left out, and why, as a sentence.
+
+    Attributes:
+        name: of the case.
+        reason: what is wrong and what would be accepted.
+        stops: whether the caller has to agree to go on without it; copies of another case are just left out.
+    """
+
+    name: str
+    reason: str
+    stops: bool = True
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where masks come from and what may be done with weights trained on them."""
+
+    source: str
+    licence: str
+    attribution: str
+    shippable: bool
+
+
+@dataclass(frozen=True)
+class Cohort:
+    """Cases of one structure by split, without the refused ones.
+
+    Attributes:
+        name: for example ``hippocampus``.
+        train, validation, test: disjoint in persons.
+        refused: what was left out.
+        provenance: source, licence and attribution.
+        side: side convention of the masks: ``left``, ``right``, ``mixed`` or ``unpaired``.
+    """
+
+    name: str
+    train: tuple[Case, ...]
+    validation: tuple[Case, ...]
+    test: tuple[Case, ...]
+    refused: tuple[Refusal, ...]
+    provenance: Provenance
+    side: str = "mixed"
+
+    @property
+    def cases(self) -> tuple[Case, ...]:
+        """All cases: train, validation, test."""
+        return self.train + self.validation + self.test
+
+    @property
+    def licence(self) -> str:
+        """Licence of the masks."""
+        return self.provenance.licence
+
+    @property
+    def attribution(self) -> str:
+        """Whom to name."""
+        return self.provenance.attribution
+
+    @property
+    def source(self) -> str:
+        """Where the masks come from."""
+        return self.provenance.source
+
+    def of_split(self, split: Split) -> tuple[Case, ...]:
+        """The cases of one split."""
+        return {"train": self.train, "validation": self.validation, "test": self.test}[split]
+
+
+def hold_out(cases: Sequence[Case], *, fraction: float, seed: int) -> tuple[Case, ...]:
+    """Move a share of the training persons to validation, all cases of a person together.
+
+    The choice depends on the persons and the seed, not on the order of the cases. One person at the
+    least is held out, unless there is only one. Nothing moves when a validation split exists already.
+    """
+    persons = sorted({case.person for case in cases if case.split == "train"})
+    if len(persons) < 2 or fraction <= 0 or any(case.split == "validation" for case in cases):
+        return tuple(cases)
+    count = min(max(1, round(fraction * len(persons))), len(persons) - 1)
+    held = set(np.random.default_rng(seed).permutation(persons)[:count].tolist())
+    return tuple(
+        replace(case, split="validation") if case.split == "train" and case.person in held else case for case in cases
+    )
+
+
+def divided_persons(cases: Iterable[Case]) -> tuple[str, ...]:
+    """Persons who stand in more than one split."""
+    splits: dict[str, set[str]] = {}
+    for case in cases:
+        splits.setdefault(case.person, set()).add(case.split)
+    return tuple(sorted(person for person, found in splits.items() if len(found) > 1))
+
+
+def refusal_error(refused: Sequence[Refusal], *, nothing_left: bool = False) -> CohortError:
+    """The error that lists each refused case and why."""
+    head = "No case is left to train on" if nothing_left else f"{len(refused)} case(s) must not be used"
+    reasons = "; ".join(f"{refusal.name}: {refusal.reason}" for refusal in refused)
+    return CohortError(f"{head}: {reasons or 'the cohort holds no masks, NIfTI, NRRD or MetaImage is accepted'}")
