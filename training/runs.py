@@ -1,0 +1,108 @@
+"""A training run's folder: what it was made of, its checkpoint, its figures; and continuing it."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from model.errors import InvalidParameter
+from training.autodecoder import AutoDecoder, Trainer, train
+from training.cohorts.cohort import Case, Cohort
+from training.config import TrainingConfig, config_from_dict
+from training.points import cohort_points, decoder_extent
+
+CHECKPOINT = "checkpoint.pt"
+RECORD = "run.json"
+#: Figures are written to the log every so many steps.
+LOG_EVERY = 50
+
+Watch = Callable[[int, dict[str, float]], None]
+
+
+def train_cohort(
+    cohort: Cohort,
+    config: TrainingConfig,
+    folder: Path,
+    *,
+    resume: bool = False,
+    watch: Watch = lambda step, figures: None,
+) -> AutoDecoder:
+    """Train on a cohort's training split; leaves ``run.json``, ``checkpoint.pt`` and ``figures.jsonl`` in the folder.
+
+    Raises:
+        InvalidParameter: the folder holds a run and `resume` is off, or its run was made of something else.
+    """
+    shapes = cohort_points(cohort.train, config.regime, config.seed)
+    config = replace(config, decoder=replace(config.decoder, extent_mm=decoder_extent(shapes)))
+    checkpoint = folder / CHECKPOINT
+    _check_folder(folder, record(cohort, config), resume=resume)
+    trainer = Trainer.start(config, shapes)
+    if resume and checkpoint.is_file():
+        trainer.load(checkpoint)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / RECORD).write_text(json.dumps(record(cohort, config), indent=2) + "\n", encoding="utf-8")
+    return train(trainer, folder, _logging_watch(folder / "figures.jsonl", watch))
+
+
+def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
+    """What a run is made of, as plain values: configuration, cohort and the cases with the hashes of their masks."""
+    return {
+        "config": config.as_dict(),
+        "cohort": cohort.name,
+        "side": cohort.side,
+        "source": cohort.source,
+        "licence": cohort.licence,
+        "attribution": cohort.attribution,
+        "shippable": cohort.provenance.shippable,
+        "train": {case.name: mask_digest(case) for case in cohort.train},
+        "validation": [case.name for case in cohort.validation],
+        "refused": {refusal.name: refusal.reason for refusal in cohort.refused},
+    }
+
+
+def read_record(folder: Path) -> tuple[TrainingConfig, dict[str, Any]]:
+    """Configuration and record of a run.
+
+    Raises:
+        InvalidParameter: the folder holds no run.
+    """
+    path = folder / RECORD
+    if not path.is_file():
+        raise InvalidParameter(
+            "The folder holds no training run; one written by morphoflow train is accepted.", part="run"
+        )
+    values = json.loads(path.read_text(encoding="utf-8"))
+    return config_from_dict(values["config"]), values
+
+
+def mask_digest(case: Case) -> str:
+    """SHA-256 over shape, place and voxels of a mask."""
+    head = repr((case.mask.shape, case.grid.affine.tolist())).encode()
+    return hashlib.sha256(head + case.mask.tobytes()).hexdigest()
+
+
+def _check_folder(folder: Path, wanted: dict[str, Any], *, resume: bool) -> None:
+    if not (folder / RECORD).is_file():
+        return
+    if not resume:
+        raise InvalidParameter(
+            "The output folder holds a run already; an empty folder, or --resume, is accepted.", part="output"
+        )
+    _, there = read_record(folder)
+    if there != json.loads(json.dumps(wanted)):
+        raise InvalidParameter(
+            "The run in the output folder was made of other masks or settings; the same ones are accepted.",
+            part="resume",
+        )
+
+
+def _logging_watch(path: Path, watch: Watch) -> Watch:
+    def both(step: int, figures: dict[str, float]) -> None:
+        if step % LOG_EVERY == 0:
+            with path.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps({"step": step, **figures}) + "\n")
+        watch(step, figures)
+
+    return both
