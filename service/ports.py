@@ -31,6 +31,20 @@ class MeshFormat(StrEnum):
     MZ3 = "mz3"
 
 
+class SampleFormat(StrEnum):
+    """Formats of synthetic shapes: meshes, a label map, or arrays."""
+
+    STL = "stl"
+    PLY = "ply"
+    OBJ = "obj"
+    GLB = "glb"
+    THREE_MF = "3mf"
+    VTP = "vtp"
+    MZ3 = "mz3"
+    NIFTI = "nifti"
+    NPZ = "npz"
+
+
 @dataclass(frozen=True)
 class Outcome:
     """A reconstruction with what is needed to evaluate it later.

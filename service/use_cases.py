@@ -96,10 +96,15 @@ def draw(model: ShapeModel, seed: int, temperature: float, spacing_mm: float | N
         InvalidParameter: temperature or spacing out of its range.
         TooLarge: the evaluated grid would have more voxels than allowed.
     """
+    require_step(model, spacing_mm, max_voxels)
+    return draw_shape(model, seed, temperature=temperature, spacing_mm=spacing_mm)
+
+
+def require_step(model: ShapeModel, spacing_mm: float | None, max_voxels: int) -> None:
+    """Refuse a spacing at which the model's box has more voxels than allowed."""
     step = model.manifest.resolution_mm if spacing_mm is None else spacing_mm
     if step > 0 and np.prod([np.ceil(2 * half / step) + 1 for half in model.manifest.half_extent_mm]) > max_voxels:
         raise _too_many_voxels(max_voxels)
-    return draw_shape(model, seed, temperature=temperature, spacing_mm=spacing_mm)
 
 
 def batch_seeds(seed: int, count: int, max_count: int) -> range:

@@ -1,0 +1,142 @@
+"""The one place where the service is wired."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from functools import partial
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as installed_version
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from fastapi_offline import FastAPIOffline
+
+from service.adapters.images import ImageLimits, read_mask, write_nifti
+from service.adapters.mesh_formats import write_mesh
+from service.adapters.result_store import DiskResultStore
+from service.adapters.workers import WorkerPool
+from service.model_registry import ModelRegistry, load_registry
+from service.observability import Log, Metrics, make_log
+from service.routes.dependencies import Services
+from service.routes.middleware import AccessMiddleware, BodyLimitMiddleware, KeyMiddleware
+from service.routes.models import models_router
+from service.routes.operations import operations_router
+from service.routes.problems import install_handlers
+from service.routes.reconstructions import reconstructions_router
+from service.routes.results import results_router
+from service.routes.samples import samples_router
+from service.schemas import Problem, SurfaceSd
+from service.settings import Settings
+
+TITLE = "MorphoFlow"
+DESCRIPTION = (
+    "Complete 3-D anatomy, with its uncertainty, from a few annotated slices. Lengths are mm, coordinates RAS in the "
+    "input's own world. Errors are problems (RFC 9457)."
+)
+
+
+def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log: Log | None = None) -> FastAPI:
+    """The application.
+
+    Args:
+        settings: everything that an operator may choose.
+        registry: the models; those that the settings name when None.
+        log: where log entries go; standard error when None.
+    """
+    engine = WorkerPool(settings.workers, settings.max_waiting)
+    store = DiskResultStore(
+        settings.results_folder, lifetime_s=settings.result_lifetime_s, max_bytes=settings.results_max_bytes
+    )
+    services = Services(
+        settings=settings,
+        registry=load_registry(settings) if registry is None else registry,
+        store=store,
+        engine=engine,
+        read_mask=mask_reader(settings),
+        write_mesh=write_mesh,
+        write_volume=write_nifti,
+        metrics=Metrics(engine),
+        log=log or make_log(settings.log_level),
+    )
+    app = FastAPIOffline(
+        redoc_url=None,
+        title=TITLE,
+        version=program_version(),
+        description=DESCRIPTION,
+        lifespan=partial(_lifespan, services=services, sweep=store.sweep, close=engine.close),
+        root_path=settings.root_path,
+    )
+    _assemble(app, services)
+    return app
+
+
+def mask_reader(settings: Settings) -> Callable[..., Any]:
+    """The reader of masks with the limits of the settings."""
+    limits = ImageLimits(max_voxels=settings.max_voxels)
+    return lambda data, part, labels: read_mask(data, part, limits, labels)
+
+
+def program_version() -> str:
+    """Version of the installed program."""
+    try:
+        return installed_version("morphoflow")
+    except PackageNotFoundError:
+        return "0+unknown"
+
+
+def _assemble(app: FastAPI, services: Services) -> None:
+    app.state.services = services
+    for router in (reconstructions_router, results_router, models_router, samples_router, operations_router):
+        app.include_router(router())
+    install_handlers(app, services.settings.retry_after_s)
+    app.add_middleware(BodyLimitMiddleware, max_bytes=services.settings.max_body_bytes)
+    app.add_middleware(KeyMiddleware, keys=services.settings.keys)
+    app.add_middleware(AccessMiddleware, log=services.log, metrics=services.metrics)
+    app.openapi = partial(describe, app)  # type: ignore[method-assign]
+
+
+def describe(app: FastAPI) -> dict[str, Any]:
+    """The interface's description (OpenAPI), made once."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        schemas = document["components"]["schemas"]
+        for kind in (Problem, SurfaceSd):
+            schemas[kind.__name__] = kind.model_json_schema(ref_template="#/components/schemas/{model}")
+        document["components"]["securitySchemes"] = {
+            "key": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
+            "bearer": {"type": "http", "scheme": "bearer"},
+        }
+        document["security"] = [{}, {"key": []}, {"bearer": []}]
+        app.openapi_schema = document
+    return app.openapi_schema
+
+
+@asynccontextmanager
+async def _lifespan(
+    _: FastAPI, *, services: Services, sweep: Callable[[], int], close: Callable[[], None]
+) -> AsyncIterator[None]:
+    for broken in services.registry.broken:
+        services.log.error("broken model", model=broken.name, reason=broken.reason)
+    services.log.info("started", models=services.registry.names())
+    sweeper = asyncio.create_task(_sweep_for_ever(sweep, services))
+    try:
+        yield
+    finally:
+        sweeper.cancel()
+        with suppress(asyncio.CancelledError):
+            await sweeper
+        close()
+        services.log.info("stopped")
+
+
+async def _sweep_for_ever(sweep: Callable[[], int], services: Services) -> None:
+    while True:
+        try:
+            removed = await asyncio.to_thread(sweep)
+        except OSError:
+            services.log.warning("the results' folder cannot be swept")
+        else:
+            if removed:
+                services.log.info("expired results removed", count=removed)
+        await asyncio.sleep(services.settings.sweep_interval_s)

@@ -1,0 +1,122 @@
+"""Domain types to wire types: what a client reads of an outcome and of a model."""
+
+import math
+
+from model.bundle import ShapeModel
+from model.inference.observations import Plane
+from model.inference.reconstruction import Estimate
+from service.ports import Outcome, StoredResult
+from service.schemas import (
+    ActiveDimensions,
+    EstimateSchema,
+    FitSchema,
+    Links,
+    ModelDescription,
+    ModelReference,
+    ModelSummary,
+    PlaneSchema,
+    PoseSchema,
+    ResidualSchema,
+    ResultSummary,
+    Summary,
+    SurfaceSdSummary,
+)
+from service.use_cases import SURFACE_SD
+
+
+def summary_of(outcome: Outcome) -> Summary:
+    """The wire form of an outcome."""
+    answer = outcome.reconstruction
+    fit = answer.state.fits[0]
+    pose = fit.pose
+    sd = answer.mesh.scalars.get(SURFACE_SD)
+    return Summary(
+        model=ModelReference(name=outcome.model_name, version=outcome.model_version, digest=outcome.model_digest),
+        fit=FitSchema(
+            status=fit.status.value,
+            converged=fit.status.value == "converged",
+            message=fit.message,
+            iterations=fit.iterations,
+        ),
+        pose=PoseSchema(
+            position_mm=pose.position.tolist(),
+            rotation=pose.rotation.tolist(),
+            scale=math.exp(pose.log_scale),
+            mirrored=pose.mirrored,
+        ),
+        uncertainty=outcome.options.uncertainty,
+        seed=outcome.options.seed,
+        observations=answer.observation_count,
+        planes=[_plane(plane) for plane in answer.planes],
+        residuals=[
+            ResidualSchema(plane=_plane(r.plane), disagreement=r.disagreement, mean_error=r.mean_error)
+            for r in answer.residuals
+        ],
+        volume_ml=_estimate(answer.volume_ml),
+        area_cm2=_estimate(answer.area_cm2),
+        surface_sd=None if sd is None else SurfaceSdSummary(mean_mm=float(sd.mean()), max_mm=float(sd.max())),
+        log_prior_density_nats=answer.log_prior_density,
+        typicality_percentile=answer.typicality_percentile,
+        warnings=list(answer.warnings),
+    )
+
+
+def result_summary(result: StoredResult, address: str) -> ResultSummary:
+    """The wire form of a kept result that stands at an address."""
+    uncertain = SURFACE_SD in result.outcome.reconstruction.mesh.scalars
+    links = Links(
+        self=address,
+        mesh=f"{address}/mesh",
+        segmentation=f"{address}/segmentation",
+        occupancy=f"{address}/occupancy",
+        uncertainty=f"{address}/uncertainty" if uncertain else None,
+        surface_sd=f"{address}/uncertainty?kind=surface_sd" if uncertain else None,
+    )
+    return ResultSummary(
+        id=result.id,
+        created=result.created,
+        expires=result.expires,
+        links=links,
+        **summary_of(result.outcome).model_dump(),
+    )
+
+
+def model_summary(model: ShapeModel, address: str) -> ModelSummary:
+    """The wire form of a model in short."""
+    manifest = model.manifest
+    return ModelSummary(
+        name=manifest.name,
+        version=manifest.version,
+        structure=manifest.structure,
+        digest=model.digest,
+        link=address,
+    )
+
+
+def model_description(model: ShapeModel, address: str) -> ModelDescription:
+    """The wire form of everything a model says about itself."""
+    manifest = model.manifest
+    low, middle, high = manifest.active_dimensions
+    return ModelDescription(
+        **model_summary(model, address).model_dump(),
+        frame=manifest.frame,
+        unit=manifest.units,
+        side=manifest.side,
+        latent_size=manifest.latent_size,
+        active_dimensions=ActiveDimensions(percent_95=low, percent_97=middle, percent_99=high),
+        half_extent_mm=list(manifest.half_extent_mm),
+        resolution_mm=manifest.resolution_mm,
+        training=manifest.training,
+        training_shapes=len(model.population.codes),
+        licence=manifest.licence,
+        attribution=manifest.attribution,
+        accuracy=manifest.accuracy,
+    )
+
+
+def _plane(plane: Plane) -> PlaneSchema:
+    return PlaneSchema(stack=plane.stack, axis=plane.axis, index=plane.index)
+
+
+def _estimate(estimate: Estimate) -> EstimateSchema:
+    return EstimateSchema(value=estimate.value, low=estimate.low, high=estimate.high)

@@ -1,0 +1,44 @@
+"""Work for a client that may go away: what has not begun is dropped, what runs stops at its next stage."""
+
+import asyncio
+import threading
+from collections.abc import Callable
+from typing import TypeVar
+
+from fastapi import Request
+
+from model.inference.reconstruction import Watch
+from service.errors import Abandoned
+from service.ports import Ticket
+
+T = TypeVar("T")
+
+
+async def run_while_connected(request: Request, ticket: Ticket, work: Callable[[Watch], T]) -> T:
+    """Result of the work, given a `watch` that raises `Abandoned` once the client is gone.
+
+    Raises:
+        Abandoned: the client went away first.
+    """
+    gone = threading.Event()
+
+    def watch(_: str) -> None:
+        if gone.is_set():
+            raise Abandoned("The client went away before the answer was ready.")
+
+    task = asyncio.ensure_future(ticket.run(lambda: work(watch)))
+    listener = asyncio.ensure_future(_disconnected(request))
+    try:
+        await asyncio.wait({task, listener}, return_when=asyncio.FIRST_COMPLETED)
+        if task.done():
+            return task.result()
+        raise Abandoned("The client went away before the answer was ready.")
+    finally:
+        gone.set()
+        task.cancel()
+        listener.cancel()
+
+
+async def _disconnected(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass

@@ -1,0 +1,55 @@
+"""What routes are given: the wired parts of the application, and a place among the work."""
+
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from model.bundle import ShapeModel
+from service.model_registry import ModelRegistry
+from service.observability import Log, Metrics
+from service.ports import MaskReader, MeshWriter, ResultStore, Ticket, VolumeWriter, WorkEngine
+from service.settings import Settings
+
+
+@dataclass(frozen=True)
+class Services:
+    """Everything that a route may use; `create_app` puts it together."""
+
+    settings: Settings
+    registry: ModelRegistry
+    store: ResultStore
+    engine: WorkEngine
+    read_mask: MaskReader
+    write_mesh: MeshWriter
+    write_volume: VolumeWriter
+    metrics: Metrics
+    log: Log
+
+
+def services_of(request: Request) -> Services:
+    """The services of the application that a request came to."""
+    services: Services = request.app.state.services
+    return services
+
+
+async def admitted(services: Annotated[Services, Depends(services_of)]) -> AsyncIterator[Ticket]:
+    """A place among running and waiting work, until the answer has been sent."""
+    with services.engine.admit() as ticket:
+        yield ticket
+
+
+def model_in_path(model: str, services: Annotated[Services, Depends(services_of)]) -> ShapeModel:
+    """The model that the path names; `UnknownModel` otherwise."""
+    return services.registry.get(model)
+
+
+WithServices = Annotated[Services, Depends(services_of)]
+WithTicket = Annotated[Ticket, Depends(admitted)]
+WithModel = Annotated[ShapeModel, Depends(model_in_path)]
+
+
+def address(request: Request, path: str) -> str:
+    """Absolute path of a resource as the client sees it, behind a proxy's prefix."""
+    return f"{request.scope.get('root_path', '').rstrip('/')}{path}"

@@ -1,0 +1,120 @@
+"""Errors as ``application/problem+json`` (RFC 9457): one shape for everything that goes wrong."""
+
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel
+from starlette.exceptions import HTTPException
+from starlette.responses import JSONResponse, Response
+
+from model.errors import InputError, InvalidParameter, MorphoFlowError
+from service.errors import PROTOCOL_KINDS, Kind, Overloaded, Unauthorised, kind_of
+from service.schemas import Problem
+
+PROBLEM_MEDIA_TYPE = "application/problem+json"
+#: Sentences for what the HTTP layer finds by itself; its own may repeat what the client sent.
+PROTOCOL_SENTENCES = {
+    400: "The request's body cannot be parsed; send multipart/form-data with a boundary.",
+    404: "Nothing stands at this address; the interface is described at /docs.",
+    405: "The method is not allowed here; the header Allow names those that are.",
+    500: "The service met a fault of its own; its logs hold more under the request id.",
+}
+
+
+def problem_response(
+    kind: Kind, detail: str, *, request_id: str | None, part: str | None = None, headers: dict[str, str] | None = None
+) -> Response:
+    """A problem as a response."""
+    problem = Problem(
+        type=kind.type, title=kind.title, status=kind.status, detail=detail, part=part, request_id=request_id
+    )
+    content = problem.model_dump(exclude_none=True)
+    return JSONResponse(content, kind.status, headers=headers, media_type=PROBLEM_MEDIA_TYPE)
+
+
+def respond_to(error: MorphoFlowError, *, request_id: str | None, retry_after_s: int) -> Response:
+    """The response to one of the project's own errors."""
+    kind = kind_of(error)
+    detail = str(error) if kind.status != 500 else PROTOCOL_SENTENCES[500]
+    part = error.part if isinstance(error, InputError) else None
+    return problem_response(kind, detail, request_id=request_id, part=part, headers=_headers(error, retry_after_s))
+
+
+def install_handlers(app: FastAPI, retry_after_s: int) -> None:
+    """Answer every error with a problem; faults of the service's own go on to the outermost layer."""
+
+    async def domain(request: Request, error: Exception) -> Response:
+        if not isinstance(error, MorphoFlowError) or kind_of(error).status == 500:
+            raise error
+        return respond_to(error, request_id=request_id_of(request), retry_after_s=retry_after_s)
+
+    async def protocol(request: Request, error: Exception) -> Response:
+        if isinstance(error.__cause__, MorphoFlowError):
+            return await domain(request, error.__cause__)
+        return _protocol(request, error)
+
+    app.add_exception_handler(MorphoFlowError, domain)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(HTTPException, protocol)
+
+
+def request_id_of(request: Request) -> str | None:
+    """The identifier under which the logs know a request."""
+    identifier: str | None = request.scope.get("state", {}).get("request_id")
+    return identifier
+
+
+def internal_error(request_id: str) -> Response:
+    """The response to a fault, with nothing of it but the identifier in the logs."""
+    return problem_response(PROTOCOL_KINDS[500], PROTOCOL_SENTENCES[500], request_id=request_id)
+
+
+def _protocol(request: Request, error: Exception) -> Response:
+    if not isinstance(error, HTTPException):
+        raise error
+    kind = PROTOCOL_KINDS.get(error.status_code, PROTOCOL_KINDS[400])
+    headers = dict(error.headers) if error.headers else None
+    return problem_response(
+        kind, PROTOCOL_SENTENCES[kind.status], request_id=request_id_of(request), headers=headers
+    )
+
+
+async def _invalid(request: Request, error: Exception) -> Response:
+    if not isinstance(error, RequestValidationError):
+        raise error
+    first = error.errors()[0]
+    part, sentence = _sentence(request, first)
+    return problem_response(
+        kind_of(InvalidParameter("", part=part)), sentence, request_id=request_id_of(request), part=part
+    )
+
+
+def _sentence(request: Request, fault: dict[str, Any]) -> tuple[str, str]:
+    names = [str(item) for item in fault["loc"][1:]] or ["body"]
+    part = names[0] if len(names) == 1 else f"{names[0]}[{names[1]}]"
+    match fault["type"]:
+        case "extra_forbidden":
+            return part, f"There is no such parameter; accepted are: {', '.join(accepted_names(request))}."
+        case "missing":
+            return part, f"The parameter {part} is missing."
+        case _:
+            reason = str(fault["msg"]).removeprefix("Value error, ")
+            return part, f"The parameter {part} is not valid: {reason[:1].lower()}{reason[1:]}."
+
+
+def accepted_names(request: Request) -> list[str]:
+    """Names of the parameters that the route of a request takes in its query or form."""
+    dependant = getattr(request.scope.get("route"), "dependant", None)
+    parameters = [*dependant.body_params, *dependant.query_params] if dependant else []
+    annotations = [parameter.field_info.annotation for parameter in parameters]
+    models = [item for item in annotations if isinstance(item, type) and issubclass(item, BaseModel)]
+    return [name for model in models for name in model.model_fields]
+
+
+def _headers(error: MorphoFlowError, retry_after_s: int) -> dict[str, str] | None:
+    if isinstance(error, Overloaded):
+        return {"Retry-After": str(retry_after_s)}
+    if isinstance(error, Unauthorised):
+        return {"WWW-Authenticate": 'Bearer realm="morphoflow"'}
+    return None

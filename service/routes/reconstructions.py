@@ -1,0 +1,125 @@
+"""``POST /v1/reconstructions``: masks in, a summary or a surface out."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Form, Request
+from fastapi.concurrency import run_in_threadpool
+from starlette.responses import JSONResponse, Response
+
+from model.errors import InvalidParameter, TooLarge, UnknownModel
+from model.inference.observations import MaskStack
+from model.inference.reconstruction import Watch
+from service import use_cases
+from service.errors import UnsupportedMediaType
+from service.observability import StageTimer
+from service.ports import MeshFormat, StoredResult
+from service.presentation import result_summary
+from service.routes.connection import run_while_connected
+from service.routes.dependencies import Services, WithServices, WithTicket, address
+from service.routes.meshes import mesh_bytes
+from service.routes.negotiation import negotiate
+from service.routes.responses import DIRECT_FORMATS, JSON, MESH_MEDIA_TYPES, attachment, files, problems
+from service.schemas import ReconstructionForm, ResultSummary, parse_labels
+
+PATH = "/v1/reconstructions"
+_OFFERED = {JSON: None, **{MESH_MEDIA_TYPES[format]: format for format in DIRECT_FORMATS}}
+
+
+def require_multipart(request: Request) -> None:
+    """Refuse other bodies: `UnsupportedMediaType`."""
+    media = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    if media != "multipart/form-data":
+        raise UnsupportedMediaType("The request's body must be multipart/form-data with one or more parts named mask.")
+
+
+def accepted_format(request: Request) -> MeshFormat | None:
+    """Mesh format that the client wants as the answer, None for the summary; `NotAcceptable` otherwise."""
+    return _OFFERED[negotiate(request.headers.get("accept"), tuple(_OFFERED))]
+
+
+def reconstructions_router() -> APIRouter:
+    """The route."""
+    router = APIRouter(tags=["reconstructions"])
+    router.add_api_route(
+        PATH,
+        create_reconstruction,
+        methods=["POST"],
+        status_code=201,
+        response_model=ResultSummary,
+        dependencies=[Depends(require_multipart)],
+        summary="Reconstruct a surface from sparse masks",
+        responses={
+            201: {
+                "description": "the summary; the header Location says where it is kept",
+                "headers": {"Location": {"schema": {"type": "string"}, "description": "address of the result"}},
+            },
+            200: files(
+                (MESH_MEDIA_TYPES[format] for format in DIRECT_FORMATS),
+                "the mesh itself, when Accept asks for one; Content-Location says where it is kept",
+            ),
+            **problems(400, 406, 413, 415, 422, 503, 507),
+        },
+    )
+    return router
+
+
+async def create_reconstruction(
+    request: Request,
+    form: Annotated[ReconstructionForm, Form(media_type="multipart/form-data")],
+    wanted: Annotated[MeshFormat | None, Depends(accepted_format)],
+    services: WithServices,
+    ticket: WithTicket,
+) -> Response:
+    """Fits the model to the annotated planes of the masks.
+
+    Answers the summary, or the mesh itself when the header Accept asks for a mesh format.
+    """
+    if len(form.mask) > services.settings.max_masks:
+        raise TooLarge(f"At most {services.settings.max_masks} parts named mask are accepted.", part="mask")
+    files_sent = [await mask.read() for mask in form.mask]
+    result = await run_while_connected(
+        request, ticket, lambda watch: _reconstruct(services, form, files_sent, watch)
+    )
+    return await run_in_threadpool(_answer, request, services, result, wanted)
+
+
+def _reconstruct(services: Services, form: ReconstructionForm, files_sent: list[bytes], watch: Watch) -> StoredResult:
+    options, labels = form.options(), parse_labels(form.label)
+    try:
+        model = services.registry.get(form.model)
+    except UnknownModel as error:
+        raise InvalidParameter(str(error), part="model") from None
+    stacks = _read_stacks(services, files_sent, labels, watch)
+    timer = StageTimer(services.metrics.stages)
+
+    def observed(stage: str) -> None:
+        watch(stage)
+        timer(stage)
+
+    outcome = use_cases.reconstruct(model, stacks, options, observed)
+    timer.finish()
+    return services.store.save(outcome)
+
+
+def _read_stacks(
+    services: Services, files_sent: list[bytes], labels: tuple[int, ...] | None, watch: Watch
+) -> tuple[MaskStack, ...]:
+    stacks = []
+    for number, data in enumerate(files_sent):
+        watch("masks")
+        stacks.append(services.read_mask(data, f"mask[{number}]", labels))
+    return tuple(stacks)
+
+
+def _answer(request: Request, services: Services, result: StoredResult, wanted: MeshFormat | None) -> Response:
+    place = address(request, f"{PATH}/{result.id}")
+    if wanted is None:
+        content = result_summary(result, place).model_dump(mode="json")
+        return JSONResponse(content, 201, headers={"Location": place, "Vary": "Accept"})
+    headers = {
+        "Content-Location": f"{place}/mesh?format={wanted.value}",
+        "Link": f'<{place}>; rel="describedby"',
+        "Vary": "Accept",
+        **attachment(f"reconstruction.{wanted.value}"),
+    }
+    return Response(mesh_bytes(services, result, wanted), media_type=MESH_MEDIA_TYPES[wanted], headers=headers)

@@ -1,0 +1,109 @@
+"""``/v1/models/{model}/samples``: synthetic shapes, one or a ZIP that streams while it is made."""
+
+import hashlib
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query, Request
+from starlette.responses import Response, StreamingResponse
+from zipstream import ZipStream
+
+from model.bundle import ShapeModel
+from service import use_cases
+from service.adapters.sample_files import MANIFEST, Draw, SampleWriter, manifest_bytes
+from service.ports import SampleFormat, Ticket
+from service.routes.connection import run_while_connected
+from service.routes.dependencies import Services, WithModel, WithServices, WithTicket
+from service.routes.models import PATH
+from service.routes.negotiation import matches_etag
+from service.routes.responses import ZIP, Responses, attachment, files, problems, sample_media_type
+from service.schemas import BatchQuery, SampleQuery, Seed
+
+#: A synthetic shape never changes: seed, query and the model's digest determine it.
+IMMUTABLE = "max-age=31536000, immutable"
+
+
+def samples_router() -> APIRouter:
+    """The routes."""
+    router = APIRouter(prefix=f"{PATH}/{{model}}/samples", tags=["samples"])
+    router.add_api_route(
+        "",
+        read_batch,
+        methods=["GET"],
+        response_class=Response,
+        summary="A batch of synthetic shapes",
+        responses={200: files([ZIP], f"one file a shape; {MANIFEST} comes last"), **problems(404, 413, 422, 503)},
+    )
+    router.add_api_route(
+        "/{seed}",
+        read_sample,
+        methods=["GET"],
+        response_class=Response,
+        summary="One synthetic shape",
+        responses={**_cached_file(), **problems(404, 413, 422, 503)},
+    )
+    return router
+
+
+async def read_sample(
+    seed: Annotated[Seed, Path()],
+    query: Annotated[SampleQuery, Query()],
+    request: Request,
+    model: WithModel,
+    services: WithServices,
+    ticket: WithTicket,
+) -> Response:
+    """A pure function of the model's digest, the seed and the query: cacheable for ever."""
+    headers = {"ETag": _etag(model, seed, query), "Cache-Control": _cache_control(services)}
+    if matches_etag(request.headers.get("if-none-match"), headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    how, writer = _draw(services, query), SampleWriter(services.write_mesh, services.write_volume)
+    file = await run_while_connected(request, ticket, lambda _: writer.make(model, seed, how))
+    return Response(file.data, media_type=sample_media_type(query.format), headers=headers | attachment(file.name))
+
+
+async def read_batch(
+    query: Annotated[BatchQuery, Query()], model: WithModel, services: WithServices, ticket: WithTicket
+) -> Response:
+    """Item i is the shape of `seed` + i, the same as on its own; the manifest comes last."""
+    seeds = use_cases.batch_seeds(query.seed, query.count, services.settings.max_samples)
+    how = _draw(services, query)
+    use_cases.require_step(model, how.spacing_mm, how.max_voxels)
+    writer = SampleWriter(services.write_mesh, services.write_volume)
+    chunks = _zip_chunks(model, seeds, how, writer, ticket)
+    return StreamingResponse(chunks, media_type=ZIP, headers=attachment(f"{model.manifest.name}-samples.zip"))
+
+
+async def _zip_chunks(
+    model: ShapeModel, seeds: range, how: Draw, writer: SampleWriter, ticket: Ticket
+) -> AsyncIterator[bytes]:
+    archive = ZipStream(sized=False)
+    entries = []
+    for seed in seeds:
+        file = await ticket.run(lambda seed=seed: writer.make(model, seed, how))
+        entries.append(file.entry)
+        archive.add(file.data, file.name)
+        for chunk in archive.all_files():
+            yield chunk
+    archive.add(manifest_bytes(model, how, entries), MANIFEST)
+    for chunk in archive.finalize():
+        yield chunk
+
+
+def _draw(services: Services, query: SampleQuery) -> Draw:
+    return Draw(query.format, query.temperature, query.spacing_mm, services.settings.max_voxels)
+
+
+def _etag(model: ShapeModel, seed: int, query: SampleQuery) -> str:
+    parts = (model.digest, seed, query.format.value, query.temperature, query.spacing_mm)
+    return f'"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}"'
+
+
+def _cache_control(services: Services) -> str:
+    return f"{'private' if services.settings.keys else 'public'}, {IMMUTABLE}"
+
+
+def _cached_file() -> Responses:
+    answer = files(map(sample_media_type, SampleFormat), "the shape in the model's canonical frame, mm")
+    answer["headers"] = {"ETag": {"schema": {"type": "string"}, "description": "strong, of model, seed and query"}}
+    return {200: answer, 304: {"description": "the client holds it already"}}
