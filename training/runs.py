@@ -7,6 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from torch.utils.tensorboard import SummaryWriter
+
 from model.errors import InvalidParameter
 from training.autodecoder import AutoDecoder, Trainer, train
 from training.cohorts.cohort import Case, Cohort
@@ -15,7 +18,9 @@ from training.points import cohort_points, decoder_extent
 
 CHECKPOINT = "checkpoint.pt"
 RECORD = "run.json"
-#: Figures are written to the log every so many steps.
+#: Folder of TensorBoard events.
+FIGURES = "figures"
+#: Figures are logged every so many steps.
 LOG_EVERY = 50
 
 Watch = Callable[[int, dict[str, float]], None]
@@ -29,7 +34,7 @@ def train_cohort(
     resume: bool = False,
     watch: Watch = lambda step, figures: None,
 ) -> AutoDecoder:
-    """Train on a cohort's training split; leaves ``run.json``, ``checkpoint.pt`` and ``figures.jsonl`` in the folder.
+    """Train on a cohort's training split; leaves ``run.json``, ``checkpoint.pt`` and the figures.
 
     Raises:
         InvalidParameter: the folder holds a run and `resume` is off, or its run was made of something else.
@@ -43,7 +48,8 @@ def train_cohort(
         trainer.load(checkpoint)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RECORD).write_text(json.dumps(record(cohort, config), indent=2) + "\n", encoding="utf-8")
-    return train(trainer, folder, _logging_watch(folder / "figures.jsonl", watch))
+    with SummaryWriter(folder / FIGURES, purge_step=trainer.step) as writer:
+        return train(trainer, folder, _logging_watch(writer, watch))
 
 
 def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
@@ -57,9 +63,20 @@ def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
         "attribution": cohort.attribution,
         "shippable": cohort.provenance.shippable,
         "train": {case.name: mask_digest(case) for case in cohort.train},
+        "volumes_ml": [float(case.mask.sum() * np.prod(case.grid.spacing) / 1000.0) for case in cohort.train],
+        "half_extent_mm": half_extent(cohort),
         "validation": [case.name for case in cohort.validation],
         "refused": {refusal.name: refusal.reason for refusal in cohort.refused},
     }
+
+
+def half_extent(cohort: Cohort) -> list[float]:
+    """Half size of the canonical box that holds every training shape, voxels included (mm along R, A, S)."""
+    reaches = []
+    for case in cohort.train:
+        world = case.grid.to_world(np.argwhere(case.mask))
+        reaches.append(np.abs(world - world.mean(axis=0)).max(axis=0) + case.grid.spacing.max() / 2)
+    return [float(value) for value in np.max(reaches, axis=0)]
 
 
 def read_record(folder: Path) -> tuple[TrainingConfig, dict[str, Any]]:
@@ -98,11 +115,11 @@ def _check_folder(folder: Path, wanted: dict[str, Any], *, resume: bool) -> None
         )
 
 
-def _logging_watch(path: Path, watch: Watch) -> Watch:
+def _logging_watch(writer: SummaryWriter, watch: Watch) -> Watch:
     def both(step: int, figures: dict[str, float]) -> None:
         if step % LOG_EVERY == 0:
-            with path.open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps({"step": step, **figures}) + "\n")
+            for name, value in figures.items():
+                writer.add_scalar(name, value, step)
         watch(step, figures)
 
     return both

@@ -1,0 +1,104 @@
+"""What a caller of the training commands may choose, and the configuration that follows from it."""
+
+from dataclasses import replace
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from model.errors import InvalidParameter
+
+if TYPE_CHECKING:
+    from training.config import TrainingConfig
+
+
+class RegimeName(StrEnum):
+    """How sparse the drawings are."""
+
+    THIN = "thin"
+    THICK = "thick"
+    ORTHOGONAL = "orthogonal"
+    DENSE = "dense"
+
+
+class SplitName(StrEnum):
+    """Which held-out cases are measured."""
+
+    VALIDATION = "validation"
+    TEST = "test"
+
+
+class ObjectiveName(StrEnum):
+    """Which objective is minimised."""
+
+    PAPER = "paper"
+    VARIATIONAL = "variational"
+
+
+class DeviceName(StrEnum):
+    """Where training runs."""
+
+    CPU = "cpu"
+    CUDA = "cuda"
+    AUTO = "auto"
+
+
+def configured(
+    objective: ObjectiveName,
+    regime: RegimeName,
+    latent_size: int,
+    *,
+    flow: bool,
+    ard: bool,
+    seed: int,
+    device: DeviceName,
+) -> "TrainingConfig":
+    """The configuration that the options describe.
+
+    ``paper`` is the MorphoFlow paper as written: points as codes, soft Dice, a plain decoder, the flow on the codes
+    themselves, batches of 6.
+    """
+    from model.networks.decoder import DecoderShape
+    from model.networks.flow import FlowShape
+    from model.networks.prior import PriorShape
+    from training.config import ObjectiveConfig, TrainingConfig
+
+    paper = objective is ObjectiveName.PAPER
+    plain = TrainingConfig()
+    prior = replace(PriorShape(FlowShape(latent_size=latent_size)), use_flow=flow, use_ard=ard, standardise=not paper)
+    loss = ObjectiveConfig(name="paper", reconstruction="dice") if paper else plain.objective
+    return replace(
+        plain,
+        decoder=DecoderShape(latent_size=latent_size, unit_columns=not paper),
+        prior=prior,
+        objective=loss,
+        regime=regime.value,
+        batch_shapes=6 if paper else plain.batch_shapes,
+        seed=seed,
+        device=resolved(device),
+    )
+
+
+def resolved(device: DeviceName) -> str:
+    """``cpu`` or ``cuda``.
+
+    Raises:
+        InvalidParameter: CUDA was asked for and is not there.
+    """
+    import torch
+
+    there = torch.cuda.is_available()
+    if device is DeviceName.CUDA and not there:
+        raise InvalidParameter("No CUDA device is there; cpu or auto is accepted.", part="device")
+    return "cuda" if there and device is not DeviceName.CPU else "cpu"
+
+
+def with_duration(config: "TrainingConfig", steps: int | None, epochs: int | None, shapes: int) -> "TrainingConfig":
+    """The configuration with its number of steps.
+
+    Raises:
+        InvalidParameter: steps and epochs were both given.
+    """
+    if steps is not None and epochs is not None:
+        raise InvalidParameter("Steps and epochs exclude each other; one of them is accepted.", part="epochs")
+    if epochs is not None:
+        steps = epochs * -(-shapes // min(config.batch_shapes, shapes))
+    return config if steps is None else replace(config, steps=steps)

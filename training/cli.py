@@ -1,0 +1,172 @@
+"""The commands train, export and evaluate; torch is imported when a command needs it.
+
+Results go to standard output, what was refused or peculiar to standard error. Exit status: 0, 2 for input that
+cannot be used (masks, models, values), 1 for a fault.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from model.errors import InvalidParameter
+from training.choices import DeviceName, ObjectiveName, RegimeName, SplitName, configured, with_duration
+from training.cohorts import Cohort, CohortName, CohortOptions
+from training.console import exit_status, finding_counts, open_cohort, progress, tell_findings
+
+if TYPE_CHECKING:
+    from model.bundle import ShapeModel
+    from training.cohorts import Case
+    from training.config import TrainingConfig
+    from training.evaluate import Measurement
+    from training.sparsify import Regime
+
+
+CohortOption = Annotated[CohortName | None, typer.Option("--cohort", help="A public cohort below the data folder.")]
+MasksOption = Annotated[Path | None, typer.Option("--masks", help="A folder of NIfTI, NRRD or MetaImage masks.")]
+LabelOption = Annotated[list[int] | None, typer.Option("--label", help="Label of the object in --masks; may repeat.")]
+DataOption = Annotated[
+    Path | None, typer.Option("--data", envvar="MORPHOFLOW_DATA", help="Folder that holds the public cohorts.")
+]
+SkipOption = Annotated[bool, typer.Option("--skip-refused", help="Go on without masks that must not be used.")]
+ShippableOption = Annotated[bool, typer.Option("--shippable", help="Only masks whose licence lets weights ship.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Write the result as JSON.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to an application."""
+    app.command("train")(train)
+    app.command("export")(export)
+    app.command("evaluate")(evaluate)
+
+
+def train(
+    cohort: CohortOption = None,
+    masks: MasksOption = None,
+    label: LabelOption = None,
+    data: DataOption = None,
+    regime: Annotated[RegimeName, typer.Option(help="How sparse the training masks are made.")] = RegimeName.DENSE,
+    objective: Annotated[ObjectiveName, typer.Option(help="What is minimised.")] = ObjectiveName.VARIATIONAL,
+    latent_size: Annotated[int, typer.Option(min=1, max=1024, help="Dimensions of the latent code.")] = 64,
+    steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps.")] = None,
+    epochs: Annotated[int | None, typer.Option(min=1, help="Passes over the cohort, in place of --steps.")] = None,
+    flow: Annotated[bool, typer.Option("--flow/--no-flow", help="Whether the prior has a flow.")] = True,
+    ard: Annotated[bool, typer.Option("--ard/--no-ard", help="Whether relevance is determined.")] = True,
+    seed: Annotated[int, typer.Option(min=0, help="Of validation persons, drawings and training.")] = 0,
+    device: Annotated[DeviceName, typer.Option(help="Where to compute.")] = DeviceName.AUTO,
+    output: Annotated[Path | None, typer.Option(help="Folder of the run.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in the output folder.")] = False,
+    skip_refused: SkipOption = False,
+    shippable: ShippableOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Train a shape model on a cohort of masks."""
+    with exit_status():
+        options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
+        found = open_cohort(cohort, masks, data, options, labels=tuple(label or ()))
+        tell_findings(found)
+        config = configured(objective, regime, latent_size, flow=flow, ard=ard, seed=seed, device=device)
+        config = with_duration(config, steps, epochs, len(found.train))
+        folder = output or Path("runs") / f"{found.name}-{regime}"
+        figures = _train_with_progress(found, config, folder, resume=resume)
+        _print_run(found, config, folder, figures, as_json=as_json)
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
+    output: Annotated[Path, typer.Option(help="Folder of the bundle; created.")],
+    name: Annotated[str | None, typer.Option(help="Name of the model; the cohort's when left out.")] = None,
+    version: Annotated[str, typer.Option(help="Version of the model.")] = "1",
+    as_json: JsonOption = False,
+) -> None:
+    """Export a run as a bundle that the service loads."""
+    with exit_status():
+        from training.release import export_run
+
+        manifest = export_run(run, output, name=name, version=version)
+        summary = {"bundle": str(output), "name": manifest.name, "version": manifest.version}
+        typer.echo(json.dumps(summary) if as_json else f"{manifest.name} {manifest.version} written to {output}")
+
+
+def evaluate(
+    model: Annotated[str, typer.Option(help="Name of a shipped model, or the folder of a bundle.")],
+    cohort: CohortOption = None,
+    masks: MasksOption = None,
+    label: LabelOption = None,
+    data: DataOption = None,
+    split: Annotated[SplitName, typer.Option(help="Which held-out cases.")] = SplitName.TEST,
+    regime: Annotated[list[RegimeName] | None, typer.Option(help="May repeat; thin, thick and orthogonal.")] = None,
+    offset: Annotated[int | None, typer.Option(min=0, help="First drawn slice; centred when left out.")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Measure only so many cases.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of validation persons and reconstructions.")] = 0,
+    output: Annotated[Path | None, typer.Option(help="CSV file with every case.")] = None,
+    skip_refused: SkipOption = False,
+    shippable: ShippableOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure a model on held-out masks, beside interpolation without a model."""
+    with exit_status():
+        from training.evaluate import open_named
+        from training.report import as_json as json_of
+        from training.report import as_text, summarise, write_csv
+
+        options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
+        opened = open_named(model)
+        found = open_cohort(cohort, masks, data, options, labels=tuple(label or ()))
+        cases = found.of_split(split.value)[:limit]
+        if not cases:
+            raise InvalidParameter(f"The cohort has no {split} cases; the other split is accepted.", part="split")
+        regimes = tuple(regime or (RegimeName.THIN, RegimeName.THICK, RegimeName.ORTHOGONAL))
+        measured = _evaluate_with_progress(opened, cases, regimes, offset, seed)
+        if output is not None:
+            output.parent.mkdir(parents=True, exist_ok=True)
+            with output.open("w", newline="", encoding="utf-8") as stream:
+                write_csv(measured, stream)
+        rows = summarise(measured)
+        typer.echo(json_of(rows) if as_json else as_text(rows))
+
+
+def _train_with_progress(cohort: Cohort, config: "TrainingConfig", folder: Path, *, resume: bool) -> dict[str, float]:
+    from training.runs import train_cohort
+
+    last: dict[str, float] = {}
+    with progress(config.steps, f"training {cohort.name}") as bar:
+
+        def watch(step: int, figures: dict[str, float]) -> None:
+            last.update(figures)
+            bar.update(bar.task_ids[0], completed=step)
+
+        train_cohort(cohort, config, folder, resume=resume, watch=watch)
+    return last
+
+
+def _print_run(
+    cohort: Cohort, config: "TrainingConfig", folder: Path, figures: dict[str, float], *, as_json: bool
+) -> None:
+    summary = {
+        "run": str(folder),
+        "steps": config.steps,
+        "train": len(cohort.train),
+        "validation": len(cohort.validation),
+        "refused": {refusal.name: refusal.reason for refusal in cohort.refused},
+        "findings": finding_counts(cohort),
+        "figures": figures,
+    }
+    words = ", ".join(f"{name} {value:.4g}" for name, value in figures.items())
+    typer.echo(json.dumps(summary) if as_json else f"{config.steps} steps in {folder}: {words or 'nothing left to do'}")
+
+
+def _evaluate_with_progress(
+    model: "ShapeModel", cases: "Sequence[Case]", regimes: Sequence[RegimeName], offset: int | None, seed: int
+) -> "list[Measurement]":
+    from training.evaluate import evaluate as measure_all
+    from training.evaluate import methods_for
+
+    names: list[Regime] = [regime.value for regime in regimes]
+    total = len(cases) * sum(len(methods_for(name)) for name in names)
+    with progress(total, f"measuring {model.manifest.name}") as bar:
+        return measure_all(
+            model, cases, names, offset=offset, seed=seed, watch=lambda found: bar.advance(bar.task_ids[0])
+        )
