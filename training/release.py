@@ -1,0 +1,133 @@
+"""A finished run as a bundle: graphs, statistics of the training codes, and a manifest."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from model.bundle import Manifest
+from model.errors import InvalidParameter
+from model.networks.export import export_graphs
+from training.autodecoder import AutoDecoder
+from training.config import TrainingConfig
+from training.runs import CHECKPOINT, read_record
+
+FORMAT = 1
+#: Shares of the base variance for which active dimensions are counted (MorphoFlow paper).
+VARIANCE_SHARES = (0.95, 0.97, 0.99)
+#: Information of one mm^2 of annotated plane where none was calibrated (1/mm^2).
+UNCALIBRATED_PRECISION = 0.1
+#: Grid step of the surface (mm) unless the caller asks otherwise.
+RESOLUTION_MM = 1.0
+
+
+def export_run(
+    run: Path,
+    output: Path,
+    *,
+    name: str | None = None,
+    version: str = "1",
+    likelihood_precision: float = UNCALIBRATED_PRECISION,
+    accuracy: Mapping[str, Mapping[str, float]] | None = None,
+) -> Manifest:
+    """Write the bundle of a finished run.
+
+    Raises:
+        InvalidParameter: the folder holds no finished run, or the output holds something already.
+        ParityError: the exported graphs disagree with the networks.
+    """
+    config, record = read_record(run)
+    module = load_module(run, config, len(record["train"]))
+    if output.exists() and any(output.iterdir()):
+        raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
+    output.mkdir(parents=True, exist_ok=True)
+    files = export_graphs(module.decoder, module.prior, output)
+    write_population(module, record, output / "population.npz")
+    sigmas = module.prior.sigma.detach().cpu().numpy().astype(float)
+    manifest = Manifest(
+        name=name or record["cohort"],
+        version=version,
+        structure=record["cohort"],
+        frame="RAS",
+        units="mm",
+        side=record["side"],
+        latent_size=config.decoder.latent_size,
+        sigmas=tuple(sigmas.tolist()),
+        active_dimensions=active_dimensions(sigmas),
+        half_extent_mm=(record["half_extent_mm"][0], record["half_extent_mm"][1], record["half_extent_mm"][2]),
+        resolution_mm=RESOLUTION_MM,
+        likelihood_precision=likelihood_precision,
+        training=training_facts(config, record),
+        licence=record["licence"],
+        attribution=record["attribution"],
+        accuracy={regime: dict(figures) for regime, figures in (accuracy or {}).items()},
+        files={file: _digest(output / file) for file in sorted([*files, "population.npz"])},
+    )
+    text = json.dumps({"format": FORMAT, **asdict(manifest)}, indent=2)
+    (output / "manifest.json").write_text(text + "\n", encoding="utf-8")
+    return manifest
+
+
+def load_module(run: Path, config: TrainingConfig, shapes: int) -> AutoDecoder:
+    """The trained module of a run, on the CPU.
+
+    Raises:
+        InvalidParameter: the run has not reached its last step.
+    """
+    path = run / CHECKPOINT
+    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True) if path.is_file() else {"step": 0}
+    if state["step"] < config.steps:
+        raise InvalidParameter(
+            f"The run stands at step {state['step']} of {config.steps}; a finished run is accepted, see --resume.",
+            part="run",
+        )
+    module = AutoDecoder(config, shapes)
+    module.load_state_dict(state["module"])
+    return module.eval()
+
+
+def write_population(module: AutoDecoder, record: Mapping[str, Any], path: Path) -> None:
+    """Codes, base codes, log densities (nats) and volumes (mL) of the training shapes."""
+    with torch.no_grad():
+        base, _ = module.prior.to_base(module.mean)
+        density = module.prior.log_density(module.mean)
+    np.savez(
+        path,
+        codes=_array(module.mean),
+        base_codes=_array(base),
+        log_densities=_array(density),
+        volumes_ml=np.array(record["volumes_ml"], float),
+    )
+
+
+def _array(values: torch.Tensor) -> Float[np.ndarray, "..."]:
+    return np.asarray(values.detach().cpu().numpy(), float)
+
+
+def active_dimensions(sigmas: Float[np.ndarray, "d"]) -> tuple[int, int, int]:
+    """How many dimensions, largest first, hold 95, 97 and 99 % of the base variance."""
+    shares = np.cumsum(np.sort(sigmas**2)[::-1]) / np.sum(sigmas**2)
+    counts = [int(np.searchsorted(shares, share - 1e-12)) + 1 for share in VARIANCE_SHARES]
+    return counts[0], counts[1], counts[2]
+
+
+def training_facts(config: TrainingConfig, record: Mapping[str, Any]) -> dict[str, object]:
+    """What a user of the bundle wants to know of its training."""
+    return {
+        "cohort": record["cohort"],
+        "source": record["source"],
+        "shapes": len(record["train"]),
+        "weights_may_ship": record["shippable"],
+        "refused": record["refused"],
+        "config": config.as_dict(),
+    }
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
