@@ -1,0 +1,66 @@
+"""Mask images that clients send, and label maps and probabilities that they get.
+
+NIfTI, NRRD (3-D Slicer's segmentations too) and MetaImage are told apart by their content, never by a
+file name. Sizes are checked from the header before anything of that size is in memory. World
+coordinates are RAS in mm. The voxels are read here from checked headers, in bounded memory, so no
+native parser meets what a stranger sent.
+"""
+
+from typing import BinaryIO, Literal
+
+from model.errors import UnreadableImage
+from model.inference.observations import MaskStack
+from model.inference.stacks import checked_labels, make_stack
+from service.adapters.image_guard import ImageLimits, Source, Volume, opened
+from service.adapters.metaimage import is_metaimage, read_metaimage
+from service.adapters.nifti import is_nifti, nifti_head, read_nifti, write_nifti
+from service.adapters.nrrd_format import is_nrrd, read_nrrd
+
+__all__ = ["ImageFormat", "ImageLimits", "Source", "image_format", "read_mask", "write_nifti"]
+
+ImageFormat = Literal["nifti", "nrrd", "metaimage"]
+
+
+def read_mask(source: Source, part: str, limits: ImageLimits, labels: frozenset[int] | None = None) -> MaskStack:
+    """A mask stack from the bytes of one image.
+
+    Args:
+        source: bytes, a path, or an open binary file that can seek (a spooled upload).
+        part: how the caller knows the image in messages, for example ``mask[0]``.
+        labels: the object's label values; all but 0 and 255 when None.
+
+    Raises:
+        UnreadableImage: no NIfTI, NRRD or MetaImage, or a damaged one.
+        TooLarge: over a limit.
+        InvalidGeometry, InvalidMask, InvalidParameter: see `model.inference.stacks.make_stack`.
+    """
+    checked_labels(labels)
+    with opened(source, part, limits) as file:
+        volume = _read(file, part, limits, labels_named=labels is not None)
+    return make_stack(part, volume.values, volume.affine, labels)
+
+
+def image_format(file: BinaryIO) -> ImageFormat | None:
+    """Which format the content is; None for anything else. Leaves the file at its start."""
+    head = file.read(512)
+    file.seek(0)
+    if is_nrrd(head):
+        return "nrrd"
+    if is_metaimage(head):
+        return "metaimage"
+    known = is_nifti(nifti_head(file))
+    file.seek(0)
+    return "nifti" if known else None
+
+
+def _read(file: BinaryIO, part: str, limits: ImageLimits, *, labels_named: bool) -> Volume:
+    found = image_format(file)
+    if found == "nifti":
+        return read_nifti(file, part, limits)
+    if found == "nrrd":
+        return read_nrrd(file, part, limits, labels_named=labels_named)
+    if found == "metaimage":
+        return read_metaimage(file, part, limits)
+    raise UnreadableImage(
+        f"{part} is not a readable image; NIfTI, NRRD and MetaImage in a single file are accepted", part=part
+    )
