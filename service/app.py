@@ -18,6 +18,7 @@ from service.adapters.result_store import DiskResultStore
 from service.adapters.workers import WorkerPool
 from service.model_registry import ModelRegistry, load_registry
 from service.observability import Log, Metrics, make_log
+from service.ports import MaskReader
 from service.routes.dependencies import Services
 from service.routes.middleware import AccessMiddleware, BodyLimitMiddleware, KeyMiddleware
 from service.routes.models import models_router
@@ -30,6 +31,8 @@ from service.schemas import Problem, SurfaceSd
 from service.settings import Settings
 
 TITLE = "MorphoFlow"
+#: Of the interface, not of the program: the second figure rises with additions, the first with breaks.
+INTERFACE_VERSION = "1.0.0"
 DESCRIPTION = (
     "Complete 3-D anatomy, with its uncertainty, from a few annotated slices. Lengths are mm, coordinates RAS in the "
     "input's own world. Errors are problems (RFC 9457)."
@@ -62,18 +65,30 @@ def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log
     app = FastAPIOffline(
         redoc_url=None,
         title=TITLE,
-        version=program_version(),
+        version=INTERFACE_VERSION,
         description=DESCRIPTION,
         lifespan=partial(_lifespan, services=services, sweep=store.sweep, close=engine.close),
         root_path=settings.root_path,
     )
-    _assemble(app, services)
+    app.state.services = services
+    _add_routes(app)
+    install_handlers(app, settings.retry_after_s)
+    app.add_middleware(BodyLimitMiddleware, max_bytes=settings.max_body_bytes)
+    app.add_middleware(KeyMiddleware, keys=settings.keys)
+    app.add_middleware(AccessMiddleware, log=services.log, metrics=services.metrics)
     return app
 
 
-def mask_reader(settings: Settings) -> Callable[..., Any]:
+def interface_document() -> dict[str, Any]:
+    """The interface's description, the same for all settings and models."""
+    app = FastAPI(title=TITLE, version=INTERFACE_VERSION, description=DESCRIPTION)
+    _add_routes(app)
+    return app.openapi()
+
+
+def mask_reader(settings: Settings) -> MaskReader:
     """The reader of masks with the limits of the settings."""
-    limits = ImageLimits(max_voxels=settings.max_voxels)
+    limits = ImageLimits(max_bytes=settings.max_body_bytes, max_voxels=settings.max_voxels)
     return lambda data, part, labels: read_mask(data, part, limits, labels)
 
 
@@ -85,14 +100,9 @@ def program_version() -> str:
         return "0+unknown"
 
 
-def _assemble(app: FastAPI, services: Services) -> None:
-    app.state.services = services
+def _add_routes(app: FastAPI) -> None:
     for router in (reconstructions_router, results_router, models_router, samples_router, operations_router):
         app.include_router(router())
-    install_handlers(app, services.settings.retry_after_s)
-    app.add_middleware(BodyLimitMiddleware, max_bytes=services.settings.max_body_bytes)
-    app.add_middleware(KeyMiddleware, keys=services.settings.keys)
-    app.add_middleware(AccessMiddleware, log=services.log, metrics=services.metrics)
     app.openapi = partial(describe, app)  # type: ignore[method-assign]
 
 

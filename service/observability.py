@@ -89,3 +89,21 @@ class StageTimer:
         if self._stage is not None:
             self._stages.labels(self._stage).observe(self._clock() - self._began)
         self._stage = None
+
+
+def uvicorn_logging(level: str) -> dict[str, Any]:
+    """Logging of the HTTP server itself (standard library, `dictConfig`), as JSON like everything else."""
+    stages = [
+        structlog.stdlib.ProcessorFormatter.remove_processors_meta,
+        structlog.processors.format_exc_info,
+        structlog.processors.JSONRenderer(),
+    ]
+    before = [structlog.stdlib.add_log_level, structlog.processors.TimeStamper(fmt="iso", utc=True)]
+    formatter = {"()": structlog.stdlib.ProcessorFormatter, "processors": stages, "foreign_pre_chain": before}
+    return {
+        "version": 1,
+        "disable_existing_loggers": False,
+        "formatters": {"json": formatter},
+        "handlers": {"stderr": {"class": "logging.StreamHandler", "formatter": "json"}},
+        "loggers": {"uvicorn": {"handlers": ["stderr"], "level": level.upper(), "propagate": False}},
+    }

@@ -5,7 +5,8 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
-from typing import Protocol, TypeVar
+from pathlib import Path
+from typing import BinaryIO, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Shaped
@@ -17,6 +18,8 @@ from model.inference.observations import MaskStack
 from model.inference.reconstruction import Options, Reconstruction
 
 T = TypeVar("T")
+#: A file as it came: its bytes, where it lies, or open for reading from its start.
+MaskSource = bytes | Path | BinaryIO
 
 
 class MeshFormat(StrEnum):
@@ -120,9 +123,9 @@ class ResultStore(Protocol):
 
 
 class MaskReader(Protocol):
-    """Bytes of one file to a mask stack."""
+    """One file to a mask stack."""
 
-    def __call__(self, data: bytes, part: str, labels: tuple[int, ...] | None) -> MaskStack:
+    def __call__(self, data: MaskSource, part: str, labels: frozenset[int] | None) -> MaskStack:
         """Foreground are the voxels with one of the labels, all non-zero ones when None."""
         ...
 
@@ -138,8 +141,8 @@ class MeshWriter(Protocol):
 class VolumeWriter(Protocol):
     """A voxel array to the bytes of a NIfTI file."""
 
-    def __call__(self, array: Shaped[np.ndarray, "i j k"], grid: Grid, description: str) -> bytes:
-        """The same volume gives the same bytes."""
+    def __call__(self, values: Shaped[np.ndarray, "i j k"], grid: Grid, description: str, /) -> bytes:
+        """The same volume gives the same bytes; values are bytes or single precision."""
         ...
 
 

@@ -40,7 +40,9 @@ class ReconstructionForm(_Closed):
     )
     uncertainty: Literal["laplace", "ensemble", "none"] = Field("laplace", description="how uncertainty is found")
     mirror: Literal["auto", "never", "always"] = Field("never", description="whether left and right are exchanged")
-    resolution_mm: SpacingMm | None = Field(None, description="grid step of the surface (mm); the model's when left out")
+    resolution_mm: SpacingMm | None = Field(
+        None, description="grid step of the surface (mm); the model's when left out"
+    )
     seed: Seed = 0
 
     def options(self) -> Options:
@@ -273,7 +275,7 @@ def parse_annotated(text: str) -> AnnotatedRule | tuple[Plane, ...]:
     """
     match text.strip():
         case "auto" | "all" | "nonempty" as rule:
-            return rule  # type: ignore[return-value]
+            return rule
     try:
         planes = [PlaneSchema.model_validate(item, strict=True) for item in json.loads(text)]
     except (ValueError, TypeError, RecursionError, ValidationError):
@@ -284,7 +286,7 @@ def parse_annotated(text: str) -> AnnotatedRule | tuple[Plane, ...]:
     return tuple(Plane(plane.stack, plane.axis, plane.index) for plane in planes)
 
 
-def parse_labels(texts: list[str]) -> tuple[int, ...] | None:
+def parse_labels(texts: list[str]) -> frozenset[int] | None:
     """The `label` parameter: repeated, separated by commas, or not there.
 
     Raises:
@@ -295,4 +297,4 @@ def parse_labels(texts: list[str]) -> tuple[int, ...] | None:
         return None
     if not all(word.isascii() and word.isdecimal() and len(word) <= 5 and 1 <= int(word) <= 65535 for word in words):
         raise InvalidParameter("The parameter label must be whole numbers from 1 to 65535.", part="label")
-    return tuple(dict.fromkeys(map(int, words)))
+    return frozenset(map(int, words))

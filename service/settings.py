@@ -42,7 +42,9 @@ class Settings(BaseSettings):
     )
     shipped_models: bool = Field(True, description="whether the models that ship with the program are loaded")
     backend: Literal["onnx", "torchscript"] = Field("onnx", description="what evaluates the networks")
-    threads: int | None = Field(None, ge=1, le=256, description="threads of one evaluation; the backend decides if unset")
+    threads: int | None = Field(
+        None, ge=1, le=256, description="threads of one evaluation; the backend decides if unset"
+    )
     api_keys: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
         (), description="accepted keys, separated by commas; a key is asked for as soon as one is set"
     )
@@ -76,8 +78,8 @@ class Settings(BaseSettings):
         settings_cls: type[BaseSettings],
         init_settings: PydanticBaseSettingsSource,
         env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003 - its name is the library's
+        file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Arguments, then the environment, then the settings file."""
         file = os.environ.get(SETTINGS_FILE_VARIABLE)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter, TooLarge
@@ -52,7 +52,7 @@ def keep(store: ResultStore, outcome: Outcome) -> StoredResult:
 class Volume:
     """A voxel array on its grid."""
 
-    array: Float[np.ndarray, "i j k"] | UInt8[np.ndarray, "i j k"]
+    array: Float32[np.ndarray, "i j k"] | UInt8[np.ndarray, "i j k"]
     grid: Grid
 
 
@@ -67,7 +67,7 @@ def probability_map(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | 
     mesh = outcome.reconstruction.mesh
     grid = outcome.grid if spacing_mm is None else covering_grid(mesh, spacing_mm)
     require_voxels(grid, max_voxels)
-    return Volume(occupancy(model, outcome.reconstruction.state, grid), grid)
+    return Volume(occupancy(model, outcome.reconstruction.state, grid).astype(np.float32), grid)
 
 
 def segmentation(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int) -> Volume:
@@ -80,7 +80,7 @@ def entropy_map(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None
     """Voxel entropy (nats); grid and errors as in `probability_map`, and `NotComputed` without uncertainty."""
     _require_uncertainty(outcome)
     volume = probability_map(catalogue, outcome, spacing_mm, max_voxels)
-    return Volume(voxel_entropy(volume.array), volume.grid)
+    return Volume(voxel_entropy(volume.array.astype(float)).astype(np.float32), volume.grid)
 
 
 def surface_sd(outcome: Outcome) -> Float[np.ndarray, "v"]:

@@ -85,15 +85,16 @@ def provenance(model: ShapeModel) -> dict[str, object]:
 
 def manifest_bytes(model: ShapeModel, how: Draw, entries: Sequence[dict[str, Any]]) -> bytes:
     """``manifest.json`` of a batch."""
+    manifest = model.manifest
     document = {
-        "model": provenance(model),
-        "space": model.manifest.frame,
-        "unit": model.manifest.units,
+        "model": {"name": manifest.name, "version": manifest.version, "digest": model.digest},
+        "space": manifest.frame,
+        "unit": manifest.units,
         "format": how.format.value,
         "temperature": how.temperature,
-        "spacing_mm": how.spacing_mm or model.manifest.resolution_mm,
-        "licence": model.manifest.licence,
-        "attribution": model.manifest.attribution,
+        "spacing_mm": how.spacing_mm or manifest.resolution_mm,
+        "licence": manifest.licence,
+        "attribution": manifest.attribution,
         "samples": list(entries),
     }
     return json.dumps(document, indent=1).encode()

@@ -29,6 +29,7 @@ class AccessMiddleware:
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one request on and record what became of it."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -38,7 +39,7 @@ class AccessMiddleware:
         began = time.perf_counter()
         try:
             await self._app(scope, receive, answer.send)
-        except Exception as fault:  # noqa: BLE001 - the last one to see it
+        except Exception as fault:
             answer.status = answer.status or 500
             self._log.error("fault", request_id=request_id, route=_route(scope), exc_info=fault)
             if answer.started:
@@ -80,6 +81,7 @@ class KeyMiddleware:
         self._keys = [key.encode() for key in keys]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one request on if it carries a key or needs none."""
         if scope["type"] == "http" and self._keys and not _is_open(scope) and not self._accepts(Headers(scope=scope)):
             error = Unauthorised("Send a valid key in the header X-API-Key or as Authorization: Bearer.")
             await _refuse(error, scope, receive, send)
@@ -101,6 +103,7 @@ class BodyLimitMiddleware:
         self._max_bytes = max_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one request on with its body counted."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return

@@ -75,9 +75,7 @@ def _protocol(request: Request, error: Exception) -> Response:
         raise error
     kind = PROTOCOL_KINDS.get(error.status_code, PROTOCOL_KINDS[400])
     headers = dict(error.headers) if error.headers else None
-    return problem_response(
-        kind, PROTOCOL_SENTENCES[kind.status], request_id=request_id_of(request), headers=headers
-    )
+    return problem_response(kind, PROTOCOL_SENTENCES[kind.status], request_id=request_id_of(request), headers=headers)
 
 
 async def _invalid(request: Request, error: Exception) -> Response:

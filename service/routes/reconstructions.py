@@ -76,20 +76,17 @@ async def create_reconstruction(
     """
     if len(form.mask) > services.settings.max_masks:
         raise TooLarge(f"At most {services.settings.max_masks} parts named mask are accepted.", part="mask")
-    files_sent = [await mask.read() for mask in form.mask]
-    result = await run_while_connected(
-        request, ticket, lambda watch: _reconstruct(services, form, files_sent, watch)
-    )
+    result = await run_while_connected(request, ticket, lambda watch: _reconstruct(services, form, watch))
     return await run_in_threadpool(_answer, request, services, result, wanted)
 
 
-def _reconstruct(services: Services, form: ReconstructionForm, files_sent: list[bytes], watch: Watch) -> StoredResult:
+def _reconstruct(services: Services, form: ReconstructionForm, watch: Watch) -> StoredResult:
     options, labels = form.options(), parse_labels(form.label)
     try:
         model = services.registry.get(form.model)
     except UnknownModel as error:
         raise InvalidParameter(str(error), part="model") from None
-    stacks = _read_stacks(services, files_sent, labels, watch)
+    stacks = _read_stacks(services, form, labels, watch)
     timer = StageTimer(services.metrics.stages)
 
     def observed(stage: str) -> None:
@@ -102,12 +99,12 @@ def _reconstruct(services: Services, form: ReconstructionForm, files_sent: list[
 
 
 def _read_stacks(
-    services: Services, files_sent: list[bytes], labels: tuple[int, ...] | None, watch: Watch
+    services: Services, form: ReconstructionForm, labels: frozenset[int] | None, watch: Watch
 ) -> tuple[MaskStack, ...]:
     stacks = []
-    for number, data in enumerate(files_sent):
+    for number, mask in enumerate(form.mask):
         watch("masks")
-        stacks.append(services.read_mask(data, f"mask[{number}]", labels))
+        stacks.append(services.read_mask(mask.file, f"mask[{number}]", labels))
     return tuple(stacks)
 
 

@@ -18,7 +18,11 @@ from service.routes.responses import JSON, MESH_MEDIA_TYPES, NIFTI, Responses, a
 from service.schemas import MeshQuery, ResultSummary, SurfaceSd, UncertaintyQuery, VolumeQuery
 from service.use_cases import Volume
 
-Identifier = Annotated[str, Path(description="identifier of the result", json_schema_extra={"format": "uuid"})]
+Identifier = Annotated[
+    str, Path(alias="id", description="identifier of the result", json_schema_extra={"format": "uuid"})
+]
+    str, Path(alias="id", description="identifier of the result", json_schema_extra={"format": "uuid"})
+]
 
 
 def results_router() -> APIRouter:
@@ -57,9 +61,7 @@ def results_router() -> APIRouter:
     return router
 
 
-def _add_volume(
-    router: APIRouter, path: str, endpoint: Callable[..., object], summary: str, answer: Responses
-) -> None:
+def _add_volume(router: APIRouter, path: str, endpoint: Callable[..., object], summary: str, answer: Responses) -> None:
     router.add_api_route(
         path,
         endpoint,
@@ -70,27 +72,27 @@ def _add_volume(
     )
 
 
-def read_summary(id: Identifier, request: Request, services: WithServices) -> JSONResponse:
+def read_summary(identifier: Identifier, request: Request, services: WithServices) -> JSONResponse:
     """Figures of a result, and where its parts are."""
-    result = services.store.load(id)
-    return JSONResponse(result_summary(result, address(request, f"{PATH}/{id}")).model_dump(mode="json"))
+    result = services.store.load(identifier)
+    return JSONResponse(result_summary(result, address(request, f"{PATH}/{identifier}")).model_dump(mode="json"))
 
 
-def delete_result(id: Identifier, services: WithServices) -> Response:
+def delete_result(identifier: Identifier, services: WithServices) -> Response:
     """Its parts can no longer be read after this."""
-    services.store.delete(id)
+    services.store.delete(identifier)
     return Response(status_code=204)
 
 
-def read_mesh(id: Identifier, query: Annotated[MeshQuery, Query()], services: WithServices) -> Response:
+def read_mesh(identifier: Identifier, query: Annotated[MeshQuery, Query()], services: WithServices) -> Response:
     """The watertight surface in the input's world, RAS mm."""
-    data = mesh_bytes(services, services.store.load(id), query.format)
+    data = mesh_bytes(services, services.store.load(identifier), query.format)
     headers = attachment(f"reconstruction.{query.format.value}")
     return Response(data, media_type=MESH_MEDIA_TYPES[query.format], headers=headers)
 
 
 async def read_segmentation(
-    id: Identifier,
+    identifier: Identifier,
     query: Annotated[VolumeQuery, Query()],
     request: Request,
     services: WithServices,
@@ -98,12 +100,12 @@ async def read_segmentation(
 ) -> Response:
     """A label map on the input's grid, or on a grid of its own at `spacing_mm`; 1 is the object."""
     return await run_while_connected(
-        request, ticket, lambda _: _nifti(services, id, query, use_cases.segmentation, "segmentation")
+        request, ticket, lambda _: _nifti(services, identifier, query, use_cases.segmentation, "segmentation")
     )
 
 
 async def read_occupancy(
-    id: Identifier,
+    identifier: Identifier,
     query: Annotated[VolumeQuery, Query()],
     request: Request,
     services: WithServices,
@@ -111,12 +113,12 @@ async def read_occupancy(
 ) -> Response:
     """The probability that a voxel lies in the object, 0 to 1."""
     return await run_while_connected(
-        request, ticket, lambda _: _nifti(services, id, query, use_cases.probability_map, "occupancy")
+        request, ticket, lambda _: _nifti(services, identifier, query, use_cases.probability_map, "occupancy")
     )
 
 
 async def read_uncertainty(
-    id: Identifier,
+    identifier: Identifier,
     query: Annotated[UncertaintyQuery, Query()],
     request: Request,
     services: WithServices,
@@ -124,21 +126,21 @@ async def read_uncertainty(
 ) -> Response:
     """Voxel entropy in nats, 0 to ln 2; with `kind=surface_sd` mm at each vertex of the mesh in PLY."""
     if query.kind == "surface_sd":
-        return await run_in_threadpool(_surface_sd, services, id)
+        return await run_in_threadpool(_surface_sd, services, identifier)
     return await run_while_connected(
-        request, ticket, lambda _: _nifti(services, id, query, use_cases.entropy_map, "entropy")
+        request, ticket, lambda _: _nifti(services, identifier, query, use_cases.entropy_map, "entropy")
     )
 
 
-def _surface_sd(services: Services, id: str) -> Response:
-    values = use_cases.surface_sd(services.store.load(id).outcome)
+def _surface_sd(services: Services, identifier: str) -> Response:
+    values = use_cases.surface_sd(services.store.load(identifier).outcome)
     return JSONResponse(SurfaceSd(surface_sd_mm=values.tolist()).model_dump(mode="json"))
 
 
 def _nifti(
-    services: Services, id: str, query: VolumeQuery, compute: Callable[..., Volume], description: str
+    services: Services, identifier: str, query: VolumeQuery, compute: Callable[..., Volume], description: str
 ) -> Response:
-    result: StoredResult = services.store.load(id)
+    result: StoredResult = services.store.load(identifier)
     volume = compute(services.registry, result.outcome, query.spacing_mm, services.settings.max_voxels)
     data = services.write_volume(volume.array, volume.grid, description)
     return Response(data, media_type=NIFTI, headers=attachment(f"{description}.nii.gz"))

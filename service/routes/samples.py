@@ -2,11 +2,12 @@
 
 import hashlib
 from collections.abc import AsyncIterator
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request
 from starlette.responses import Response, StreamingResponse
-from zipstream import ZipStream
+from zipstream import ZipStream  # type: ignore[import-untyped]
 
 from model.bundle import ShapeModel
 from service import use_cases
@@ -80,7 +81,7 @@ async def _zip_chunks(
     archive = ZipStream(sized=False)
     entries = []
     for seed in seeds:
-        file = await ticket.run(lambda seed=seed: writer.make(model, seed, how))
+        file = await ticket.run(partial(writer.make, model, seed, how))
         entries.append(file.entry)
         archive.add(file.data, file.name)
         for chunk in archive.all_files():

@@ -1,0 +1,137 @@
+"""The command line: ``morphoflow serve | reconstruct | sample | models | openapi``, and commands of other packages.
+
+Exit status: 0 done, 2 the input is at fault (one sentence on standard error), 1 a fault of the program.
+"""
+
+import sys
+from collections.abc import Iterable, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+import uvicorn
+import yaml
+
+from model.errors import CohortError, InputError, MorphoFlowError, NotFound
+from service.app import create_app, interface_document, program_version
+from service.commands import models, reconstruct, sample
+from service.observability import uvicorn_logging
+from service.settings import Settings, load_settings, require_protection
+
+PROGRAM = "morphoflow"
+#: Packages that bring further commands register a callable that takes the typer application.
+COMMAND_GROUP = "morphoflow.commands"
+BAD_INPUT, FAULT = 2, 1
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit status."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    app = build_app()
+    missing = load_plugins(app, entry_points(group=COMMAND_GROUP))
+    if missing and words and not words[0].startswith("-") and words[0] not in command_names(app):
+        typer.echo("\n".join(missing), err=True)
+        return BAD_INPUT
+    try:
+        app(args=words, prog_name=PROGRAM)
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else FAULT if stop.code else 0
+    except (InputError, NotFound, CohortError) as error:
+        typer.echo(f"{PROGRAM}: {error}", err=True)
+        return BAD_INPUT
+    except MorphoFlowError as error:
+        typer.echo(f"{PROGRAM}: {error}", err=True)
+        return FAULT
+    return 0
+
+
+def build_app() -> typer.Typer:
+    """The commands of the service."""
+    app = typer.Typer(
+        help="Complete 3-D anatomy, with its uncertainty, from a few annotated slices.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+    )
+    app.callback()(_program)
+    for command in (serve, reconstruct, sample, models, openapi):
+        app.command()(command)
+    return app
+
+
+def load_plugins(app: typer.Typer, entries: Iterable[EntryPoint]) -> list[str]:
+    """Let other packages add their commands; a sentence for each that lacks a library."""
+    sentences = []
+    for entry in entries:
+        try:
+            entry.load()(app)
+        except ImportError as error:
+            library = (error.name or "a library").split(".")[0]
+            extra = f"{PROGRAM}[{entry.name}]"
+            sentences.append(f"The commands of {entry.name} need {library}; install them with: pip install '{extra}'.")
+    return sentences
+
+
+def command_names(app: typer.Typer) -> set[str]:
+    """Names of the commands that an application has."""
+    commands = {info.name or getattr(info.callback, "__name__", "") for info in app.registered_commands}
+    return {name.replace("_", "-") for name in commands | {group.name or "" for group in app.registered_groups}}
+
+
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port to listen on.")] = None,
+) -> None:
+    """Answer HTTP requests."""
+    given: dict[str, Any] = {"host": host, "port": port}
+    settings = load_settings({name: value for name, value in given.items() if value is not None})
+    require_protection(settings)
+    app = create_app(settings)
+    typer.echo(f"Try it from another terminal:\n\n  {example_request(settings)}\n", err=True)
+    uvicorn.run(
+        app,
+        host=settings.host,
+        port=settings.port,
+        access_log=False,
+        log_config=uvicorn_logging(settings.log_level),
+        server_header=False,
+        timeout_graceful_shutdown=30,
+    )
+
+
+def openapi(
+    output: Annotated[Path | None, typer.Option(help="File to write; standard output when left out.")] = None,
+) -> None:
+    """Write the interface's description (openapi.yaml)."""
+    text = interface_yaml()
+    if output is None:
+        typer.echo(text, nl=False)
+    else:
+        output.write_text(text, encoding="utf-8")
+
+
+def interface_yaml() -> str:
+    """The interface's description as it stands in ``openapi.yaml``."""
+    return yaml.safe_dump(interface_document(), sort_keys=False, allow_unicode=True, width=120)
+
+
+def example_request(settings: Settings) -> str:
+    """A request for the shell that works as it stands."""
+    host = "127.0.0.1" if settings.host in ("0.0.0.0", "::") else settings.host
+    address = f"[{host}]" if ":" in host else host
+    key = '-H "X-API-Key: $KEY" ' if settings.keys else ""
+    url = f"http://{address}:{settings.port}{settings.root_path}/v1/reconstructions"
+    return f"curl {key}-H 'Accept: model/stl' -F mask=@mask.nii.gz -o surface.stl {url}"
+
+
+def _program(
+    version: Annotated[bool, typer.Option("--version", is_eager=True, help="Print the version.")] = False,
+) -> None:
+    if version:
+        typer.echo(program_version())
+        raise typer.Exit
+
+
+if __name__ == "__main__":
+    sys.exit(main())

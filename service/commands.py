@@ -1,0 +1,189 @@
+"""The commands ``reconstruct``, ``sample`` and ``models``: the use cases without HTTP."""
+
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from model.bundle import ShapeModel
+from model.errors import InvalidParameter
+from model.inference.fitting import MirrorRule
+from model.inference.observations import MaskStack
+from model.inference.reconstruction import Options, UncertaintyRule
+from service import use_cases
+from service.adapters.images import write_nifti
+from service.adapters.mesh_formats import write_mesh
+from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, manifest_bytes
+from service.app import mask_reader
+from service.console import echo_json, progress, require_free, require_suffix
+from service.model_registry import ModelRegistry, load_registry
+from service.ports import MeshFormat, Outcome, SampleFormat
+from service.presentation import model_summary, summary_of
+from service.schemas import EstimateSchema, ModelList, Summary, parse_annotated, parse_labels
+from service.settings import Settings, load_settings
+
+#: Suffix of volumes that commands write.
+NIFTI_SUFFIX = "nii.gz"
+#: Steps of a reconstruction that a progress bar counts: masks, then the four stages.
+STEPS = 5
+
+ModelOption = Annotated[str | None, typer.Option(help="Model name; may be left out when only one is loaded.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
+
+
+def reconstruct(
+    masks: Annotated[list[Path], typer.Argument(metavar="MASK...", help="Sparse segmentations of one object.")],
+    model: ModelOption = None,
+    label: Annotated[list[str] | None, typer.Option(help="Label value or values; all non-zero when left out.")] = None,
+    annotated: Annotated[str, typer.Option(help="auto, all, nonempty, or a JSON list of planes.")] = "auto",
+    uncertainty: Annotated[UncertaintyRule, typer.Option(help="How uncertainty is found.")] = "laplace",
+    mirror: Annotated[MirrorRule, typer.Option(help="Whether left and right are exchanged.")] = "never",
+    resolution_mm: Annotated[float | None, typer.Option(help="Grid step of the surface (mm).")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=use_cases.MAX_SEED, help="Makes the answer repeatable.")] = 0,
+    output: Annotated[Path | None, typer.Option(help="Surface to write; its suffix says the format.")] = None,
+    segmentation: Annotated[Path | None, typer.Option(help="Label map to write (.nii.gz).")] = None,
+    entropy: Annotated[Path | None, typer.Option(help="Voxel entropy to write (.nii.gz).")] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Reconstruct a surface from sparse masks."""
+    targets = {"--output": output, "--segmentation": segmentation, "--entropy": entropy}
+    format = require_suffix("--output", output, tuple(MeshFormat))
+    for option, path in list(targets.items())[1:]:
+        require_suffix(option, path, (NIFTI_SUFFIX,))
+    require_free(targets, force=force)
+    if entropy is not None and uncertainty == "none":
+        raise InvalidParameter("--entropy needs --uncertainty laplace or ensemble.", part="--entropy")
+    settings = load_settings()
+    registry = load_registry(settings)
+    options = Options(parse_annotated(annotated), uncertainty, mirror, resolution_mm, seed)
+    with progress(STEPS) as watch:
+        watch("masks")
+        stacks = _read(settings, masks, parse_labels(label or []))
+        outcome = use_cases.reconstruct(registry.get(model), stacks, options, watch)
+        _write_mesh(outcome, output, format)
+        _write_volume(registry, outcome, segmentation, use_cases.segmentation, settings.max_voxels)
+        _write_volume(registry, outcome, entropy, use_cases.entropy_map, settings.max_voxels)
+    summary = summary_of(outcome)
+    echo_json(summary) if as_json else typer.echo(_sentences(summary))
+
+
+def sample(
+    output: Annotated[Path, typer.Option(help="Folder, or a file that ends with .zip.")],
+    model: ModelOption = None,
+    count: Annotated[int, typer.Option(help="How many.")] = 16,
+    seed: Annotated[int, typer.Option(help="Seed of the first one; the next one's is one more.")] = 0,
+    format: Annotated[SampleFormat, typer.Option(help="File format.")] = SampleFormat.STL,
+    temperature: Annotated[float, typer.Option(help="Spread of the shapes; 1 is the population's.")] = 1.0,
+    spacing_mm: Annotated[float | None, typer.Option(help="Grid step (mm); the model's when left out.")] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw synthetic shapes from a model."""
+    settings = load_settings()
+    chosen = load_registry(settings).get(model)
+    seeds = use_cases.batch_seeds(seed, count, use_cases.MAX_SEED)
+    how = Draw(format, temperature, spacing_mm, settings.max_voxels)
+    if output.suffix.lower() == ".zip":
+        require_free({"--output": output}, force=force)
+        manifest = _sample_to_zip(chosen, seeds, how, output)
+    else:
+        manifest = _sample_to_folder(chosen, seeds, how, output, force=force)
+    typer.echo(manifest.decode() if as_json else f"{count} shapes of {chosen.manifest.name} written.")
+
+
+def models(as_json: JsonOption = False) -> None:
+    """List the models."""
+    registry = load_registry(load_settings())
+    loaded = [model_summary(model, f"/v1/models/{model.manifest.name}") for model in use_cases.describe(registry)]
+    if as_json:
+        echo_json(ModelList(models=loaded))
+    else:
+        table = Table("name", "version", "structure", "digest")
+        for model in loaded:
+            table.add_row(model.name, model.version, model.structure, model.digest[:12])
+        Console().print(table)
+    for broken in registry.broken:
+        typer.echo(f"{broken.name} is not loaded: {broken.reason}", err=True)
+
+
+def _read(settings: Settings, masks: list[Path], labels: frozenset[int] | None) -> tuple[MaskStack, ...]:
+    read = mask_reader(settings)
+    for number, path in enumerate(masks):
+        if not path.is_file():
+            raise InvalidParameter(
+                f"mask[{number}] must be a file; there is none of this name.", part=f"mask[{number}]"
+            )
+    return tuple(read(path, f"mask[{number}]", labels) for number, path in enumerate(masks))
+
+
+def _write_mesh(outcome: Outcome, path: Path | None, format: str) -> None:
+    if path is None:
+        return
+    metadata = {"model": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest}
+    path.write_bytes(write_mesh(outcome.reconstruction.mesh, format, space="RAS", metadata=metadata))
+
+
+def _write_volume(
+    registry: ModelRegistry,
+    outcome: Outcome,
+    path: Path | None,
+    compute: Callable[..., use_cases.Volume],
+    max_voxels: int,
+) -> None:
+    if path is None:
+        return
+    volume = compute(registry, outcome, None, max_voxels)
+    path.write_bytes(write_nifti(volume.array, volume.grid, compute.__name__.replace("_", " ")))
+
+
+def _sample_to_zip(model: ShapeModel, seeds: range, how: Draw, target: Path) -> bytes:
+    with zipfile.ZipFile(target, "w") as archive:
+        manifest = _make_all(model, seeds, how, lambda file: archive.writestr(file.name, file.data))
+        archive.writestr(MANIFEST, manifest)
+    return manifest
+
+
+def _sample_to_folder(model: ShapeModel, seeds: range, how: Draw, target: Path, *, force: bool) -> bytes:
+    if target.exists() and not target.is_dir():
+        raise InvalidParameter("--output must be a folder or end with .zip.", part="--output")
+    if not force and target.is_dir() and any(target.iterdir()):
+        raise InvalidParameter("--output names a folder that is not empty; --force writes into it.", part="--output")
+    target.mkdir(parents=True, exist_ok=True)
+    manifest = _make_all(model, seeds, how, lambda file: (target / file.name).write_bytes(file.data))
+    (target / MANIFEST).write_bytes(manifest)
+    return manifest
+
+
+def _make_all(model: ShapeModel, seeds: range, how: Draw, put: Callable[[SampleFile], Any]) -> bytes:
+    writer, entries = SampleWriter(write_mesh, write_nifti), []
+    with progress(len(seeds)) as step:
+        for seed in seeds:
+            step(f"seed {seed}")
+            file = writer.make(model, seed, how)
+            put(file)
+            entries.append(file.entry)
+    return manifest_bytes(model, how, entries)
+
+
+def _sentences(summary: Summary) -> str:
+    fit = summary.fit
+    lines = [
+        f"{summary.model.name} {summary.model.version}: {fit.message} ({fit.iterations} iterations)",
+        f"volume {_figure(summary.volume_ml)} mL, surface area {_figure(summary.area_cm2)} cm^2",
+        f"typicality: percentile {summary.typicality_percentile:.0f} of the training population",
+    ]
+    if summary.surface_sd is not None:
+        lines.append(f"surface SD {summary.surface_sd.mean_mm:.2f} mm (most {summary.surface_sd.max_mm:.2f} mm)")
+    return "\n".join([*lines, *(f"warning: {warning}" for warning in summary.warnings)])
+
+
+def _figure(estimate: EstimateSchema) -> str:
+    if estimate.low is None or estimate.high is None:
+        return f"{estimate.value:.2f}"
+    return f"{estimate.value:.2f} (90 %: {estimate.low:.2f} to {estimate.high:.2f})"

@@ -1,0 +1,63 @@
+"""What commands share: progress on a terminal, files that are not overwritten, output for machines."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import typer
+from pydantic import BaseModel
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from model.errors import InvalidParameter
+from model.inference.reconstruction import Watch
+
+
+@contextmanager
+def progress(total: int) -> Iterator[Watch]:
+    """A bar on standard error that moves on at each call with the next step's name; silent in a pipe."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("", total=total + 1, completed=-1)
+
+        def step(name: str) -> None:
+            bar.update(task, description=name, advance=1)
+
+        yield step
+
+
+def require_free(paths: dict[str, Path | None], *, force: bool) -> None:
+    """Refuse to overwrite, and refuse folders that are not there, before any work is done.
+
+    Raises:
+        InvalidParameter: names the option.
+    """
+    for option, path in paths.items():
+        if path is None:
+            continue
+        if path.is_dir() or not path.parent.is_dir():
+            raise InvalidParameter(f"{option} must name a file in a folder that exists.", part=option)
+        if path.exists() and not force:
+            raise InvalidParameter(f"{option} names a file that exists; --force overwrites it.", part=option)
+
+
+def require_suffix(option: str, path: Path | None, suffixes: tuple[str, ...]) -> str:
+    """The accepted suffix that a file name ends with, without its dot; the empty string for no path.
+
+    Raises:
+        InvalidParameter: it ends with none of them.
+    """
+    if path is None:
+        return ""
+    for suffix in suffixes:
+        if path.name.lower().endswith(f".{suffix}"):
+            return suffix
+    accepted = ", ".join(f".{suffix}" for suffix in suffixes)
+    raise InvalidParameter(f"{option} must end with one of: {accepted}.", part=option)
+
+
+def echo_json(document: BaseModel) -> None:
+    """One JSON document on standard output."""
+    typer.echo(document.model_dump_json(indent=1))
