@@ -85,10 +85,10 @@ def shape_points(found: Window, regime: Regime, rng: np.random.Generator, limit:
     near = near_contour(drawing, regime)
     index = np.argwhere(drawing.annotated & ~_unknown_on(drawing.stack.grid, found))
     index = rng.permutation(index)[:limit]
-    world = np.concatenate([drawing.stack.grid.to_world(index), _far_cover(found, rng)])
+    world = np.concatenate([drawing.stack.grid.to_world(index.astype(float)), _far_cover(found, rng)])
     at = tuple(index.T)
     background = np.zeros(len(world) - len(index), bool)
-    centre = found.grid.to_world(np.argwhere(found.mask)).mean(axis=0)
+    centre = found.grid.to_world(np.argwhere(found.mask).astype(float)).mean(axis=0)
     return ShapePoints(
         (world - centre).astype(np.float32),
         np.concatenate([drawing.stack.foreground[at], background]),
@@ -127,7 +127,8 @@ def _unknown_on(grid: Grid, found: Window) -> Bool[np.ndarray, "i j k"]:
     """The window's unknown voxels on a drawing's own grid, by the nearest voxel."""
     if not found.unknown.any():
         return np.zeros(grid.shape, bool)
-    index = np.rint(found.grid.to_index(grid.centres())).astype(int)
+    centres = np.indices(grid.shape).reshape(3, -1).T.astype(float)
+    index = np.rint(found.grid.to_index(grid.to_world(centres))).astype(int)
     index = np.clip(index, 0, np.array(found.grid.shape) - 1)
     return np.asarray(found.unknown[tuple(index.T)].reshape(grid.shape))
 

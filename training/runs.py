@@ -74,7 +74,7 @@ def half_extent(cohort: Cohort) -> list[float]:
     """Half size of the canonical box that holds every training shape, voxels included (mm along R, A, S)."""
     reaches = []
     for case in cohort.train:
-        world = case.grid.to_world(np.argwhere(case.mask))
+        world = case.grid.to_world(np.argwhere(case.mask).astype(float))
         reaches.append(np.abs(world - world.mean(axis=0)).max(axis=0) + case.grid.spacing.max() / 2)
     return [float(value) for value in np.max(reaches, axis=0)]
 

@@ -157,7 +157,7 @@ def random_slices(mask: Bool[np.ndarray, "i j k"], rng: np.random.Generator) -> 
 def labelled_points(drawing: Drawing) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
     """All voxels that were looked at: world points (RAS mm) and occupancy labels."""
     index = np.argwhere(drawing.annotated)
-    return drawing.stack.grid.to_world(index), drawing.stack.foreground[tuple(index.T)]
+    return drawing.stack.grid.to_world(index.astype(float)), drawing.stack.foreground[tuple(index.T)]
 
 
 def _draw(mask: Bool[np.ndarray, "i j k"], grid: Grid, chosen: list[tuple[int, int]]) -> Drawing:

@@ -11,6 +11,7 @@ import numpy as np
 import SimpleITK as sitk
 from jaxtyping import Bool, Float, Shaped
 from nibabel.filebasedimages import ImageFileError
+from nibabel.spatialimages import HeaderDataError
 
 from model.errors import InvalidMask, UnreadableImage
 from model.geometry import Grid
@@ -18,7 +19,7 @@ from model.inference.stacks import make_stack
 
 SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd")
 #: The readers' own errors for a file that is damaged, cut short or of another kind.
-READ_ERRORS = (ImageFileError, OSError, EOFError, RuntimeError, ValueError, zlib.error)
+READ_ERRORS = (ImageFileError, HeaderDataError, OSError, EOFError, RuntimeError, ValueError, zlib.error)
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def read_mask(path: Path, labels: Collection[int] = ()) -> MaskFile:
 
 def _read_nifti(path: Path) -> tuple[Shaped[np.ndarray, "..."], Float[np.ndarray, "4 4"], tuple[str, ...]]:
     library: Any = nib
-    image = library.Nifti1Image.from_filename(path)
+    image = library.load(path)
     values = np.asarray(image.dataobj)
     stated = int(image.header["sform_code"]) > 0 or int(image.header["qform_code"]) > 0
     findings = () if stated else ("the header states no orientation, left and right may be exchanged",)

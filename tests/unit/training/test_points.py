@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+
+from model.geometry import Grid
+from tests.analytic_shapes import Ellipsoid
+from training.cohorts import Case
+from training.points import BAND_MM, cohort_points, decoder_extent, shape_points, window
+from training.sparsify import REGIMES
+
+AFFINE = np.array([[0.0, 0.0, 1.5, -20.0], [-1.0, 0.0, 0.0, 30.0], [0.0, 1.0, 0.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
+LIMIT = 100_000
+
+
+def ellipsoid_case(margin=6, name="e"):
+    grid = Grid((24 + 2 * margin, 30 + 2 * margin, 14 + 2 * margin), AFFINE)
+    centre = grid.to_world((np.array([grid.shape]) - 1) / 2)[0]
+    shape = Ellipsoid((9.0, 11.0, 13.0), centre)
+    return Case(name, name, "train", shape.mask(grid), grid), shape
+
+
+@pytest.mark.parametrize("margin", [0, 3, 12])
+def test_a_window_moves_no_voxel_in_the_world(margin):
+    case, _ = ellipsoid_case(margin)
+    found = window(case)
+    before = case.grid.to_world(np.argwhere(case.mask).astype(float))
+    after = found.grid.to_world(np.argwhere(found.mask).astype(float))
+    assert np.allclose(np.sort(before, axis=0), np.sort(after, axis=0))
+
+
+@pytest.mark.parametrize("regime", ["thin", "orthogonal", "dense"])
+def test_labels_are_those_of_the_shape_at_the_points(regime):
+    case, shape = ellipsoid_case()
+    found = shape_points(window(case), regime, np.random.default_rng(0), LIMIT)
+    world = found.points + shape.centre
+    clear = np.abs(shape.logits(world)) > 1e-3
+    assert np.array_equal(found.labels[clear], shape.logits(world)[clear] > 0)
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_near_points_lie_around_the_contour_and_both_labels_are_there(regime):
+    case, shape = ellipsoid_case()
+    found = shape_points(window(case), regime, np.random.default_rng(1), LIMIT)
+    assert found.labels.any()
+    assert (~found.labels).any()
+    assert found.near.any()
+    if regime == "dense":
+        deep = np.abs(shape.logits(found.points + shape.centre)) > BAND_MM + 1.5
+        assert not found.near[deep].any()
+
+
+def test_beyond_a_face_that_cuts_the_object_nothing_is_said():
+    mask = np.zeros((10, 10, 10), bool)
+    mask[3:7, 3:7, 4:] = True
+    case = Case("cut", "cut", "train", mask, Grid(mask.shape, np.eye(4)))
+    centre = np.argwhere(mask).mean(axis=0)
+    for regime in REGIMES:
+        open_end = shape_points(window(case), regime, np.random.default_rng(0), LIMIT).points + centre
+        closed = shape_points(window(case, cut_is_end=True), regime, np.random.default_rng(0), LIMIT).points + centre
+        inside_columns = (open_end[:, :2] > 3).all(axis=1) & (open_end[:, :2] < 6).all(axis=1)
+        assert not (open_end[inside_columns, 2] > 9.5 + 4).any()
+        assert (closed[:, 2] > 9.5).any()
+
+
+def test_points_are_a_pure_function_of_their_seed():
+    cases = [ellipsoid_case(name=str(n))[0] for n in range(2)]
+    one, other = cohort_points(cases, "orthogonal", 3), cohort_points(cases, "orthogonal", 3)
+    assert all(np.array_equal(a.points, b.points) for a, b in zip(one, other, strict=True))
+    different = cohort_points(cases, "orthogonal", 4)
+    assert any(
+        a.points.shape != b.points.shape or not np.allclose(a.points, b.points)
+        for a, b in zip(one, different, strict=True)
+    )
+
+
+def test_the_extent_holds_every_shape():
+    found = [shape_points(window(ellipsoid_case()[0]), "dense", np.random.default_rng(0), LIMIT)]
+    extent = decoder_extent(found)
+    assert extent > np.abs(found[0].points[found[0].labels]).max()
+    assert extent == pytest.approx(13.0 * 1.25, abs=2.0)
