@@ -21,8 +21,6 @@ from service.use_cases import Volume
 Identifier = Annotated[
     str, Path(alias="id", description="identifier of the result", json_schema_extra={"format": "uuid"})
 ]
-    str, Path(alias="id", description="identifier of the result", json_schema_extra={"format": "uuid"})
-]
 
 
 def results_router() -> APIRouter:
