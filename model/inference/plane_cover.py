@@ -94,7 +94,7 @@ class _Progress:
     """
 
     left: Bool[np.ndarray, "i j k"]
-    counts: tuple[Int[np.ndarray, "m"], ...]
+    counts: tuple[Int[np.ndarray, "_"], ...]
     support: tuple[Bool[np.ndarray, "i j k"], ...]
     chosen: list[AxisPlane]
 
@@ -130,7 +130,7 @@ def _mixed_cover(box: Bool[np.ndarray, "i j k"], limit: int) -> list[AxisPlane]:
     return _without_needless(box, progress.chosen) if len(progress.chosen) <= limit else []
 
 
-def _fullest(counts: tuple[Int[np.ndarray, "m"], ...]) -> AxisPlane:
+def _fullest(counts: tuple[Int[np.ndarray, "_"], ...]) -> AxisPlane:
     axis = max(range(3), key=lambda a: (counts[a].max(), a))
     return axis, int(np.argmax(counts[axis]))
 
@@ -145,7 +145,7 @@ def _add_specks(box: Bool[np.ndarray, "i j k"], progress: _Progress) -> None:
     everywhere = (np.ones_like(box),) * 3
     specks = _begin(progress.left, everywhere, progress.chosen)
     totals = [np.maximum(box.sum(axis=_others(axis)), 1) for axis in range(3)]
-    while specks.left.any():
+    while specks.counts[0].any():
         used = [axis for axis, _ in specks.chosen]
         options = [
             (float(specks.counts[a][i] / totals[a][i]), int(specks.counts[a][i]), used.count(a), a, -int(i))

@@ -11,7 +11,7 @@ from jaxtyping import Float, Shaped
 
 from model.errors import InvalidGeometry, InvalidMask, InvalidParameter
 from model.geometry import SHEAR_TOLERANCE, Grid
-from model.inference.observations import MaskStack
+from model.inference.mask_stack import MaskStack
 
 #: Value of voxels that were never looked at.
 EXCLUDED_VALUE = 255

@@ -1,0 +1,112 @@
+"""Which planes of the stacks were looked at: by a rule of the interface, or by name."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from model.errors import InconsistentStacks, InvalidMask, InvalidParameter
+from model.geometry import Grid
+from model.inference.mask_stack import MaskStack, Plane, index_box, occupied, section_of, world_box
+from model.inference.plane_cover import cover_planes
+
+AnnotatedRule = Literal["auto", "all", "nonempty"]
+
+#: Boxes around the foreground of two stacks may lie this far apart (mm).
+WORLD_GAP_MM = 20.0
+#: Spacings that differ by less than this share are equal.
+SPACING_TOLERANCE = 1e-3
+#: Fewest planes from which a shape can be reconstructed.
+FEWEST_PLANES = 2
+
+
+def find_planes(stacks: Sequence[MaskStack], rule: AnnotatedRule | Sequence[Plane]) -> tuple[Plane, ...]:
+    """The annotated planes by a rule of the interface, or those named, checked against the stacks.
+
+    ``all`` takes every plane along the axis of the largest spacing, ``nonempty`` those of them that hold
+    foreground, ``auto`` the fewest planes along any axes that together hold all foreground
+    (`model.inference.plane_cover`). Each stack is judged by itself; planes are counted over all of them.
+    Planes without foreground are annotated by ``all`` and by name only: between two drawn slices of a
+    sparse stack nobody has looked.
+
+    Returns:
+        the planes in ascending order, each once.
+
+    Raises:
+        InvalidMask: fewer than two planes, or no foreground on them.
+        InvalidParameter: a named plane that its stack does not have, or fewer than two named.
+        InconsistentStacks: foregrounds of two stacks over `WORLD_GAP_MM` apart.
+    """
+    _check_same_world(stacks)
+    if isinstance(rule, str):
+        planes = tuple(
+            Plane(number, axis, index)
+            for number, stack in enumerate(stacks)
+            for axis, index in sorted(_planes_by_rule(stack, rule))
+        )
+        _check_count(stacks, planes)
+    else:
+        planes = _named_planes(stacks, rule)
+    if not any(section_of(stacks[p.stack].foreground, p).any() for p in planes):
+        raise InvalidMask("mask holds no foreground on its annotated planes; at least one voxel is needed", part="mask")
+    return planes
+
+
+def _planes_by_rule(stack: MaskStack, rule: AnnotatedRule) -> list[tuple[int, int]]:
+    drawn = stack.foreground & ~stack.excluded
+    if rule == "auto":
+        return cover_planes(drawn)
+    thick = _thickest_axes(stack.grid)
+    held = {axis: occupied(drawn, axis) for axis in thick}
+    if rule == "nonempty":
+        axis = min(thick, key=lambda a: (len(held[a]), -a))
+        return [(axis, int(index)) for index in held[axis]]
+    auto_axes = [a for a, _ in cover_planes(drawn)] if len(thick) > 1 else []
+    axis = max(thick, key=lambda a: (auto_axes.count(a), a))
+    return [(axis, int(index)) for index in occupied(~stack.excluded, axis)]
+
+
+def _thickest_axes(grid: Grid) -> list[int]:
+    spacing = grid.spacing
+    return [axis for axis in range(3) if spacing[axis] >= spacing.max() * (1.0 - SPACING_TOLERANCE)]
+
+
+def _check_count(stacks: Sequence[MaskStack], planes: tuple[Plane, ...]) -> None:
+    if len(planes) < FEWEST_PLANES:
+        part = stacks[0].part if len(stacks) == 1 else "mask"
+        found = "one slice only" if planes else "no annotated plane"
+        raise InvalidMask(f"{part} holds {found}; at least two annotated planes are needed", part=part)
+
+
+def _named_planes(stacks: Sequence[MaskStack], named: Sequence[Plane]) -> tuple[Plane, ...]:
+    for position, plane in enumerate(named):
+        part = f"annotated[{position}]"
+        if not 0 <= plane.stack < len(stacks):
+            raise InvalidParameter(f"{part} names stack {plane.stack}; 0 to {len(stacks) - 1} is accepted", part=part)
+        if not 0 <= plane.axis < 3:
+            raise InvalidParameter(f"{part} names axis {plane.axis}; 0 to 2 is accepted", part=part)
+        size = stacks[plane.stack].grid.shape[plane.axis]
+        if not 0 <= plane.index < size:
+            raise InvalidParameter(
+                f"{part} names plane {plane.index} along axis {plane.axis} of {stacks[plane.stack].part}; "
+                f"0 to {size - 1} is accepted",
+                part=part,
+            )
+    planes = tuple(sorted(set(named)))
+    if len(planes) < FEWEST_PLANES:
+        raise InvalidParameter("annotated must name at least two different planes", part="annotated")
+    return planes
+
+
+def _check_same_world(stacks: Sequence[MaskStack]) -> None:
+    boxes = [world_box(stack.grid, *index_box(stack.foreground)) for stack in stacks]
+    for second in range(len(stacks)):
+        for first in range(second):
+            lows = np.maximum(boxes[first][0], boxes[second][0])
+            highs = np.minimum(boxes[first][1], boxes[second][1])
+            if (lows - highs).max() > WORLD_GAP_MM:
+                raise InconsistentStacks(
+                    f"{stacks[first].part} and {stacks[second].part} lie over {WORLD_GAP_MM:g} mm apart in the world; "
+                    "stacks of one object in one frame are accepted",
+                    part=stacks[second].part,
+                )
