@@ -24,6 +24,8 @@ from model.inference.plane_sampling import (
 
 __all__ = ["AnnotatedRule", "MaskStack", "Observations", "Plane", "find_planes", "observe"]
 
+#: Index ranges of a part of a grid.
+Window = tuple[slice, slice, slice]
 #: The cover of the rest reaches this far (mm) beyond the box around all foreground.
 COVER_MARGIN_MM = 30.0
 #: Distance (mm) from the contour over which the cover thins out to half.
@@ -32,6 +34,10 @@ COVER_DECAY_MM = 5.0
 COVER_SHARE = 0.2
 #: Smallest number of observations that can be asked for.
 SMALLEST_BUDGET = 16
+#: Planes are thinned out evenly when their sections have more voxels than this together.
+CANDIDATE_LIMIT = 1 << 21
+#: At least this many planes are left by thinning out.
+FEWEST_THINNED = 16
 #: Indices that differ by less than this (voxels) are equal.
 ROUNDING = 1e-6
 
@@ -86,7 +92,8 @@ def observe(stacks: Sequence[MaskStack], planes: Sequence[Plane], *, budget: int
     not excluded, in each stack's smallest index window around the box of all foreground grown by
     `COVER_MARGIN_MM`. A voxel where two planes cross is used once, for the plane in whose section it is
     nearer to the contour (the finer plane, when equally near). A band larger than the budget less
-    `COVER_SHARE` is sampled in the same way.
+    `COVER_SHARE` is sampled in the same way. Dense volumes, whose sections have over `CANDIDATE_LIMIT` voxels,
+    are seen on every second, third, ... plane, and each of those stands for as many.
 
     Args:
         planes: as `find_planes` returns them.
@@ -99,21 +106,32 @@ def observe(stacks: Sequence[MaskStack], planes: Sequence[Plane], *, budget: int
     """
     if budget < SMALLEST_BUDGET:
         raise InvalidParameter(f"budget must be at least {SMALLEST_BUDGET} observations", part="budget")
-    candidates = _candidates(stacks, planes)
+    rng = np.random.default_rng(seed)
+    windows = _windows(stacks)
+    step = _plane_step(planes, windows)
+    candidates = _candidates(stacks, planes, windows, range(int(rng.integers(step)), len(planes), step))
     if not candidates.voxel.size:
         raise InvalidMask("mask holds no voxel that was looked at on its annotated planes", part="mask")
     spacings = [_in_plane_spacing(stacks[plane.stack].grid, plane) for plane in planes]
     area = np.array([float(spacing.prod()) for spacing in spacings])[candidates.plane_of]
     band = np.array([band_width(spacing) for spacing in spacings])[candidates.plane_of]
-    rows, weights = _draw(candidates.distance, band, area, budget, np.random.default_rng(seed))
+    rows, weights = _draw(candidates.distance, band, area, budget, rng)
     drawn = candidates.at(rows)
     points = _world_points(stacks, planes, drawn)
-    return Observations(points, drawn.label.astype(float), weights, tuple(planes), drawn.plane_of)
+    return Observations(points, drawn.label.astype(float), weights * step, tuple(planes), drawn.plane_of)
 
 
-def _candidates(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> _Candidates:
-    windows = _windows(stacks)
-    parts = [_section_candidates(stacks[p.stack], p, n, windows[p.stack]) for n, p in enumerate(planes)]
+def _plane_step(planes: Sequence[Plane], windows: Sequence[Window]) -> int:
+    """Every how manieth plane is used: one in ``step``, from a random one on."""
+    extents = np.array([[cut.stop - cut.start for cut in window] for window in windows])
+    voxels = sum(int(np.delete(extents[plane.stack], plane.axis).prod()) for plane in planes)
+    return max(1, min(-(-voxels // CANDIDATE_LIMIT), len(planes) // FEWEST_THINNED))
+
+
+def _candidates(
+    stacks: Sequence[MaskStack], planes: Sequence[Plane], windows: Sequence[Window], numbers: Sequence[int]
+) -> _Candidates:
+    parts = [_section_candidates(stacks[planes[n].stack], planes[n], n, windows[planes[n].stack]) for n in numbers]
     every = _Candidates(
         np.concatenate([part.voxel for part in parts]),
         np.concatenate([part.plane_of for part in parts]),
@@ -135,7 +153,7 @@ def _first_of_each(found: _Candidates, stacks: Sequence[MaskStack], planes: Sequ
     return order[np.concatenate([[True], ~same])] if order.size else order
 
 
-def _windows(stacks: Sequence[MaskStack]) -> list[tuple[slice, slice, slice]]:
+def _windows(stacks: Sequence[MaskStack]) -> list[Window]:
     """In each stack, the smallest index window around the box of all foreground and the margin."""
     boxes = [world_box(stack.grid, *index_box(stack.foreground)) for stack in stacks]
     low = np.min([box[0] for box in boxes], axis=0) - COVER_MARGIN_MM
@@ -143,14 +161,14 @@ def _windows(stacks: Sequence[MaskStack]) -> list[tuple[slice, slice, slice]]:
     return [_index_window(stack.grid, box_corners(low, high)) for stack in stacks]
 
 
-def _index_window(grid: Grid, corners: Float[np.ndarray, "8 3"]) -> tuple[slice, slice, slice]:
+def _index_window(grid: Grid, corners: Float[np.ndarray, "8 3"]) -> Window:
     index = grid.to_index(corners)
     first = np.clip(np.ceil(index.min(axis=0) - ROUNDING), 0, grid.shape).astype(int)
     end = np.clip(np.floor(index.max(axis=0) + ROUNDING) + 1, first, grid.shape).astype(int)
     return slice(first[0], end[0]), slice(first[1], end[1]), slice(first[2], end[2])
 
 
-def _section_candidates(stack: MaskStack, plane: Plane, number: int, window: tuple[slice, slice, slice]) -> _Candidates:
+def _section_candidates(stack: MaskStack, plane: Plane, number: int, window: Window) -> _Candidates:
     """The section's voxels that were looked at, within the window."""
     first, second = (axis for axis in range(3) if axis != plane.axis)
     cut = (window[first], window[second])

@@ -345,6 +345,18 @@ def test_the_cover_stays_near_the_object():
     np.testing.assert_allclose(observations.weights.sum(), 2 * 70**2, rtol=0.1)
 
 
+def test_large_dense_volumes_are_seen_on_evenly_spaced_planes():
+    solid = ellipsoid((60.0, 55.0, 50.0), (70.0, 69.0, 71.0), (140, 140, 140))
+    stack = stack_of(solid)
+    planes = find_planes([stack], "all")
+    seen = [observe([stack], planes, budget=4000, seed=seed) for seed in range(8)]
+    assert {int(index) % 2 for o in seen for index in o.points[:, 2]} == {0, 1}
+    for observations in seen:
+        assert len({int(index) % 2 for index in observations.points[:, 2]}) == 1
+        np.testing.assert_allclose(observations.weights.sum(), solid.size, rtol=0.05)
+        np.testing.assert_allclose(observations.weights @ observations.labels, solid.sum(), rtol=0.1)
+
+
 def test_two_stacks_give_points_of_both_in_one_world():
     solid = ellipsoid()
     one = stack_of(cut(solid, [(2, 8), (2, 16)]), origin=(5.0, 0.0, 0.0))
