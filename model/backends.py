@@ -4,9 +4,12 @@ ONNX Runtime stands behind them by default, TorchScript when asked for. Batches 
 (starts, ensemble members, samples) are evaluated in one call, each with its own latent code.
 """
 
-from typing import Protocol
+import os
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+import onnxruntime
 from jaxtyping import Float
 
 
@@ -42,3 +45,92 @@ class Prior(Protocol):
     def from_base(self, base: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
         """``z = g^-1(z0)``."""
         ...
+
+
+class OnnxDecoder:
+    """A bundle's decoder on ONNX Runtime."""
+
+    def __init__(self, folder: Path, latent_size: int, threads: int | None) -> None:
+        self.latent_size = latent_size
+        self._logits = _session(folder / "decoder_logits.onnx", threads)
+        self._jacobians = _session(folder / "decoder_jacobians.onnx", threads)
+
+    def logits(self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n"]:
+        """See `Decoder`."""
+        return _run(self._logits, latent=latent, points=points)[0]
+
+    def logits_and_jacobians(
+        self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]
+    ) -> tuple[Float[np.ndarray, "b n"], Float[np.ndarray, "b n d"], Float[np.ndarray, "b n 3"]]:
+        """See `Decoder`."""
+        logits, by_latent, by_point = _run(self._jacobians, latent=latent, points=points)
+        return logits, by_latent, by_point
+
+
+class OnnxPrior:
+    """A bundle's prior on ONNX Runtime."""
+
+    def __init__(self, folder: Path, latent_size: int, threads: int | None) -> None:
+        self.latent_size = latent_size
+        self._density = _session(folder / "prior_density.onnx", threads)
+        self._steps = [_session(path, threads) for path in _numbered(folder, ".onnx")]
+
+    def log_density(self, latent: Float[np.ndarray, "b d"]) -> tuple[Float[np.ndarray, "b"], Float[np.ndarray, "b d"]]:
+        """See `Prior`."""
+        density, gradient, _ = _run(self._density, latent=latent)
+        return density, gradient
+
+    def to_base(self, latent: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
+        """See `Prior`."""
+        return _run(self._density, latent=latent)[2]
+
+    def from_base(self, base: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
+        """See `Prior`."""
+        value = base
+        for step in reversed(self._steps):
+            value = _fixed_point(step, value)
+        return value
+
+
+def load_onnx(folder: Path, latent_size: int, threads: int | None) -> tuple[Decoder, Prior]:
+    """Decoder and prior of a bundle on ONNX Runtime (CPU)."""
+    return OnnxDecoder(folder, latent_size, threads), OnnxPrior(folder, latent_size, threads)
+
+
+def load_torchscript(folder: Path, latent_size: int, threads: int | None) -> tuple[Decoder, Prior]:
+    """Decoder and prior of a bundle on TorchScript; needs the extra ``torch``."""
+    from model.networks import torchscript
+
+    return torchscript.load(folder, latent_size, threads)
+
+
+def _fixed_point(step: Any, target: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
+    """Repeat an autoregressive inverse step; after as many steps as dimensions it is exact."""
+    guess = target
+    for _ in range(target.shape[1]):
+        following = _run(step, target=target, guess=guess)[0]
+        if np.array_equal(following, guess):
+            break
+        guess = following
+    return guess
+
+
+def _numbered(folder: Path, suffix: str) -> list[Path]:
+    found = folder.glob(f"prior_sampling_*{suffix}")
+    return sorted(found, key=lambda path: int(path.stem.rsplit("_", 1)[1]))
+
+
+def _session(path: Path, threads: int | None) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or os.cpu_count() or 1
+    options.inter_op_num_threads = 1
+    # Idle workers that spin steal cycles from the arithmetic around the graph.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def _run(session: onnxruntime.InferenceSession, **feeds: Float[np.ndarray, "..."]) -> list[Float[np.ndarray, "..."]]:
+    single = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in feeds.items()}
+    results: list[Float[np.ndarray, "..."]] = session.run(None, single)
+    return results

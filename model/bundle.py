@@ -1,15 +1,22 @@
 """The exported artefact: a folder with a manifest, network graphs and statistics of the training codes."""
 
-from dataclasses import dataclass
+import hashlib
+import json
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from model.backends import Decoder, Prior
+from model.backends import Decoder, Prior, load_onnx, load_torchscript
+from model.errors import BundleCorrupt, BundleIncomplete, BundleTooNew
 
 BackendName = Literal["onnx", "torchscript"]
+#: Format of the bundles that this program writes, and the newest that it reads.
+FORMAT = 1
+MANIFEST = "manifest.json"
+POPULATION = "population.npz"
 
 
 @dataclass(frozen=True)
@@ -79,4 +86,58 @@ def open_bundle(folder: Path, *, backend: BackendName = "onnx", threads: int | N
     Raises:
         BundleIncomplete, BundleCorrupt, BundleTooNew: it cannot be trusted; the sentence says why.
     """
-    raise NotImplementedError
+    manifest, digest = read_manifest(folder)
+    for name, expected in manifest.files.items():
+        _check_file(folder / name, expected)
+    load = {"onnx": load_onnx, "torchscript": load_torchscript}[backend]
+    decoder, prior = load(folder, manifest.latent_size, threads)
+    return ShapeModel(manifest, digest, _read_population(folder / POPULATION), decoder, prior)
+
+
+def read_manifest(folder: Path) -> tuple[Manifest, str]:
+    """Manifest and its SHA-256, without opening the graphs.
+
+    Raises:
+        BundleIncomplete, BundleCorrupt, BundleTooNew: see `open_bundle`.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        raise BundleIncomplete(f"The bundle has no {MANIFEST}; a folder written by morphoflow export is accepted.")
+    data = path.read_bytes()
+    try:
+        values = json.loads(data)
+        written = int(values.pop("format"))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BundleCorrupt(f"{MANIFEST} cannot be parsed; one written by morphoflow export is accepted.") from error
+    if written > FORMAT:
+        raise BundleTooNew(f"The bundle has format {written}; this program reads formats up to {FORMAT}.")
+    return _manifest_of(values), hashlib.sha256(data).hexdigest()
+
+
+def write_manifest(manifest: Manifest, folder: Path) -> None:
+    """Write ``manifest.json``; inverse of `read_manifest`."""
+    values = {"format": FORMAT, **{f.name: getattr(manifest, f.name) for f in fields(Manifest)}}
+    (folder / MANIFEST).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+
+
+def _manifest_of(values: dict[str, Any]) -> Manifest:
+    known = {f.name for f in fields(Manifest)}
+    missing = sorted(known - values.keys())
+    if missing:
+        raise BundleCorrupt(f"{MANIFEST} lacks {', '.join(missing)}; one written by morphoflow export is accepted.")
+    values = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items() if name in known}
+    if POPULATION not in values["files"]:
+        raise BundleCorrupt(f"{MANIFEST} lists no {POPULATION}; one written by morphoflow export is accepted.")
+    return Manifest(**values)
+
+
+def _check_file(path: Path, expected: str) -> None:
+    if not path.is_file():
+        raise BundleIncomplete(f"The bundle lacks {path.name}, which its manifest lists.")
+    if hashlib.sha256(path.read_bytes()).hexdigest() != expected:
+        raise BundleCorrupt(f"{path.name} differs from the SHA-256 in the manifest; export or copy the bundle anew.")
+
+
+def _read_population(path: Path) -> Population:
+    with np.load(path, allow_pickle=False) as stored:
+        return Population(**{f.name: stored[f.name] for f in fields(Population)})

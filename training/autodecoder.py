@@ -58,7 +58,7 @@ class AutoDecoder(nn.Module):
         ard = self.prior.ard_loss(weights.a, weights.b)
         total = rec + weights.lambda_flow * density.mean()
         if self.config.prior.use_ard:
-            total = total + weights.lambda_ard * ard / len(self.mean)
+            total = total + weights.lambda_ard * ard
         return {"loss": total, "reconstruction": rec, "prior": density.mean(), "ard": ard}
 
 

@@ -28,8 +28,8 @@ class ObjectiveConfig:
     name: ObjectiveName = "variational"
     reconstruction: ReconstructionName = "bce"
     lambda_flow: float = 1e-3
-    lambda_ard: float = 1e-3
-    a: float = 1.5
+    lambda_ard: float = 5e-5
+    a: float = 2.0
     b: float = 1e-4
 
 

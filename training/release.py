@@ -1,9 +1,7 @@
 """A finished run as a bundle: graphs, statistics of the training codes, and a manifest."""
 
 import hashlib
-import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +9,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from model.bundle import Manifest
+from model.bundle import POPULATION, Manifest, write_manifest
 from model.errors import InvalidParameter
 from model.networks.export import export_graphs
 from training.autodecoder import AutoDecoder
 from training.config import TrainingConfig
 from training.runs import CHECKPOINT, read_record
 
-FORMAT = 1
 #: Shares of the base variance for which active dimensions are counted (MorphoFlow paper).
 VARIANCE_SHARES = (0.95, 0.97, 0.99)
 #: Information of one mm^2 of annotated plane where none was calibrated (1/mm^2).
@@ -48,7 +45,7 @@ def export_run(
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
     output.mkdir(parents=True, exist_ok=True)
     files = export_graphs(module.decoder, module.prior, output)
-    write_population(module, record, output / "population.npz")
+    write_population(module, record, output / POPULATION)
     sigmas = module.prior.sigma.detach().cpu().numpy().astype(float)
     manifest = Manifest(
         name=name or record["cohort"],
@@ -67,10 +64,9 @@ def export_run(
         licence=record["licence"],
         attribution=record["attribution"],
         accuracy={regime: dict(figures) for regime, figures in (accuracy or {}).items()},
-        files={file: _digest(output / file) for file in sorted([*files, "population.npz"])},
+        files={file: _digest(output / file) for file in sorted([*files, POPULATION])},
     )
-    text = json.dumps({"format": FORMAT, **asdict(manifest)}, indent=2)
-    (output / "manifest.json").write_text(text + "\n", encoding="utf-8")
+    write_manifest(manifest, output)
     return manifest
 
 

@@ -146,7 +146,7 @@ def pose_offset(start: Pose, pose: Pose) -> Float[np.ndarray, "7"]:
 
 def fit(model: ShapeModel, observations: Observations, options: FitOptions) -> Fit:
     """The best of the fits from every starting pose that the options allow."""
-    fits = [_fit_from(model, observations, start, options) for start in starting_poses(observations, options)]
+    fits = [fit_from(model, observations, start, options) for start in starting_poses(observations, options)]
     return min(fits, key=lambda found: found.objective)
 
 
@@ -158,14 +158,19 @@ def starting_poses(observations: Observations, options: FitOptions) -> Sequence[
     return [Pose(position=centre, mirrored=side) for side in sides]
 
 
-def _fit_from(model: ShapeModel, observations: Observations, start: Pose, options: FitOptions) -> Fit:
+def fit_from(
+    model: ShapeModel,
+    observations: Observations,
+    start: Pose,
+    options: FitOptions,
+    latent: Float[np.ndarray, "d"] | None = None,
+) -> Fit:
+    """Fit from one starting pose, and one starting code (the centre of the latent space when None)."""
     objective = _Objective(model, observations, start, options)
-    latent = np.zeros(model.manifest.latent_size)
-    point, count, _ = _descend(objective, latent, start, 0.3, replace(options, tolerance=1.0, max_iterations=8))
+    code = np.zeros(model.manifest.latent_size) if latent is None else latent
+    point, count, _ = _descend(objective, code, start, 0.3, replace(options, tolerance=1.0, max_iterations=8))
     point, more, status = _descend(objective, point.latent, point.pose, 1.0, options)
-    return Fit(
-        point.latent, point.pose, status, _SENTENCES[status], count + more, point.value, point.curvature
-    )
+    return Fit(point.latent, point.pose, status, _SENTENCES[status], count + more, point.value, point.curvature)
 
 
 def _descend(

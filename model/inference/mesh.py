@@ -65,6 +65,17 @@ def vertex_areas(mesh: Mesh) -> Float[np.ndarray, "v"]:
     return np.bincount(mesh.faces.ravel(), np.repeat(third, 3), minlength=len(mesh.vertices)).astype(float)
 
 
+def area_gradient(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
+    """Derivative of the surface area (mm^2) by each vertex's position (mm); it points along the mean curvature normal."""
+    a, b, c = _corners(mesh.vertices, mesh.faces)
+    normal = unit(np.cross(b - a, c - a))
+    by_corner = np.stack([np.cross(c - b, normal), np.cross(a - c, normal), np.cross(b - a, normal)], axis=1) / -2.0
+    number = mesh.faces.ravel()
+    parts = by_corner.reshape(-1, 3)
+    sums = [np.bincount(number, parts[:, axis], minlength=len(mesh.vertices)) for axis in range(3)]
+    return np.asarray(np.stack(sums, axis=1))
+
+
 def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
     """Unit normals, faces weighted by area; a vertex without area gets the zero vector."""
     weighted = np.repeat(_area_vectors(vertices, faces), 3, axis=0)

@@ -4,21 +4,34 @@ observations -> fit -> surface -> uncertainty. Reads no setting, no clock and no
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from model.bundle import ShapeModel
-from model.geometry import Grid
-from model.inference.fitting import Fit, MirrorRule
+from model.errors import InvalidParameter
+from model.inference.ensemble import fit_ensemble
+from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
 from model.inference.mesh import Mesh
-from model.inference.observations import AnnotatedRule, MaskStack, Plane
+from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
+from model.inference.posterior import fitted_logits, laplace_covariance
+from model.inference.surface import surface_of
+from model.inference.uncertainty import Estimate, ShapeState, area_estimate, displacement_factors, volume_estimate
 
 UncertaintyRule = Literal["laplace", "ensemble", "none"]
 #: Called with the name of each stage as it begins: observations, fit, surface, uncertainty.
 Watch = Callable[[str], None]
+
+#: Point observations used of all voxels on the annotated planes.
+OBSERVATION_BUDGET = 2500
+#: Range of `Options.resolution_mm`.
+RESOLUTION_RANGE_MM = (0.25, 10.0)
+#: Below this percentile of the training population a shape is called unlike it.
+ATYPICAL_PERCENTILE = 1.0
+#: Above this disagreement of a plane (1 - Dice) the answer names it.
+DISAGREEMENT_LIMIT = 0.25
 
 
 @dataclass(frozen=True)
@@ -41,40 +54,18 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A figure with its 90 % interval; `low` and `high` are None when uncertainty was not asked for."""
-
-    value: float
-    low: float | None
-    high: float | None
-
-
-@dataclass(frozen=True)
 class PlaneResidual:
     """How far one drawn plane and the reconstruction's section disagree.
 
     Attributes:
         plane: which plane.
-        disagreement: share of the observations' weight on the wrong side of the surface, 0 to 1.
+        disagreement: 1 - Dice between the drawing and the reconstruction's section, 0 to 1.
         mean_error: mean signed occupancy residual (label minus probability).
     """
 
     plane: Plane
     disagreement: float
     mean_error: float
-
-
-@dataclass(frozen=True)
-class ShapeState:
-    """What is needed to evaluate the reconstructed field anywhere: one or more weighted members.
-
-    Attributes:
-        fits: the fit (Laplace, none) or the ensemble's members.
-        covariance: (p, p) posterior covariance over (latent, pose step) of the first fit, or None.
-    """
-
-    fits: tuple[Fit, ...]
-    covariance: Float[np.ndarray, "p p"] | None
 
 
 @dataclass(frozen=True)
@@ -115,19 +106,83 @@ def reconstruct(
         InconsistentStacks: the stacks cannot be of one object.
         InvalidParameter: an option out of its range.
     """
-    raise NotImplementedError
+    _check(options)
+    watch("observations")
+    planes = find_planes(stacks, options.annotated)
+    observations = observe(stacks, planes, budget=OBSERVATION_BUDGET, seed=options.seed)
+    watch("fit")
+    found = fit(model, observations, FitOptions(mirror=options.mirror))
+    watch("surface")
+    mesh = surface_of(model, found.latent, found.pose, options.resolution_mm)
+    watch("uncertainty")
+    state = _state(model, observations, found, options)
+    factors = displacement_factors(model, state, mesh)
+    if factors is not None:
+        mesh = replace(mesh, scalars={"surface_sd_mm": np.linalg.norm(factors, axis=1)})
+    residuals = plane_residuals(model, found, observations)
+    density, percentile = typicality(model, found)
+    return Reconstruction(
+        state=state,
+        mesh=mesh,
+        planes=observations.planes,
+        observation_count=len(observations.points),
+        residuals=residuals,
+        volume_ml=volume_estimate(mesh, factors),
+        area_cm2=area_estimate(mesh, factors),
+        log_prior_density=density,
+        typicality_percentile=percentile,
+        warnings=_warnings(found, percentile, residuals),
+    )
 
 
-def occupancy(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndarray, "i j k"]:
-    """Posterior mean occupancy probability at the voxel centres of a grid."""
-    raise NotImplementedError
+def _check(options: Options) -> None:
+    low, high = RESOLUTION_RANGE_MM
+    step = options.resolution_mm
+    if step is not None and not low <= step <= high:
+        raise InvalidParameter(
+            f"resolution_mm is {step:g}; a grid step from {low:g} to {high:g} mm is accepted.", part="resolution_mm"
+        )
 
 
-def covering_grid(mesh: Mesh, spacing_mm: float, margin_mm: float = 5.0) -> Grid:
-    """Axis-aligned RAS grid around a mesh."""
-    raise NotImplementedError
+def _state(model: ShapeModel, observations: Observations, found: Fit, options: Options) -> ShapeState:
+    if options.uncertainty == "ensemble":
+        return ShapeState((found, *fit_ensemble(model, observations, found, options.seed)), None)
+    return ShapeState((found,), laplace_covariance(found) if options.uncertainty == "laplace" else None)
 
 
-def voxel_entropy(probability: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
-    """Entropy of a Bernoulli variable (nats), 0 to ln 2."""
-    raise NotImplementedError
+def plane_residuals(model: ShapeModel, found: Fit, observations: Observations) -> tuple[PlaneResidual, ...]:
+    """Disagreement of each drawn plane with the reconstruction's section through it."""
+    logits = fitted_logits(model, found, observations.points)
+    probability = 1.0 / (1.0 + np.exp(-logits.astype(float)))
+    return tuple(
+        _residual(plane, probability[here], observations.labels[here], observations.weights[here])
+        for number, plane in enumerate(observations.planes)
+        for here in [observations.plane_of == number]
+    )
+
+
+def _residual(
+    plane: Plane, probability: Float[np.ndarray, "n"], labels: Float[np.ndarray, "n"], weights: Float[np.ndarray, "n"]
+) -> PlaneResidual:
+    inside = probability > 0.5
+    total = float(weights @ (labels + inside))
+    overlap = 2.0 * float(weights @ (labels * inside)) / total if total > 0 else 1.0
+    mean_error = float(weights @ (labels - probability) / max(weights.sum(), 1e-9))
+    return PlaneResidual(plane, 1.0 - overlap, mean_error)
+
+
+def typicality(model: ShapeModel, found: Fit) -> tuple[float, float]:
+    """Log prior density of the fitted code (nats) and its percentile in the training population."""
+    density = float(model.prior.log_density(found.latent[None])[0][0])
+    return density, float(100.0 * np.mean(model.population.log_densities < density))
+
+
+def _warnings(found: Fit, percentile: float, residuals: Sequence[PlaneResidual]) -> tuple[str, ...]:
+    sentences = [] if found.status == "converged" else [found.message]
+    if percentile < ATYPICAL_PERCENTILE:
+        sentences.append("The shape is unlike the population that the model was trained on; do not rely on it.")
+    apart = [r.plane for r in residuals if r.disagreement > DISAGREEMENT_LIMIT]
+    if apart:
+        names = ", ".join(f"mask[{p.stack}] axis {p.axis} index {p.index}" for p in apart)
+        sentences.append(f"The reconstruction disagrees with the drawing on {names}; do not rely on it there.")
+    return tuple(sentences)

@@ -6,7 +6,15 @@ import numpy as np
 from jaxtyping import Float
 
 from model.bundle import ShapeModel
+from model.errors import InvalidParameter
+from model.geometry import Pose
 from model.inference.mesh import Mesh
+from model.inference.surface import surface_of
+
+#: Accepted temperatures: above 0, at most this.
+HIGHEST_TEMPERATURE = 2.0
+#: Accepted grid steps (mm).
+SPACING_RANGE_MM = (0.25, 10.0)
 
 
 @dataclass(frozen=True)
@@ -26,10 +34,42 @@ class SampledShape:
     mesh: Mesh
 
 
-def draw_shape(model: ShapeModel, seed: int, *, temperature: float = 1.0, spacing_mm: float | None = None) -> SampledShape:
+def draw_shape(
+    model: ShapeModel, seed: int, *, temperature: float = 1.0, spacing_mm: float | None = None
+) -> SampledShape:
     """One shape, a pure function of (bundle, seed, temperature, spacing).
 
+    Args:
+        seed: non-negative.
+        temperature: factor on the standard deviations of the base, in (0, 2].
+        spacing_mm: grid step of the surface, 0.25 to 10; the model's own when None.
+
     Raises:
-        InvalidParameter: temperature outside (0, 2] or spacing outside [0.25, 10] mm.
+        InvalidParameter: an argument out of its range.
     """
-    raise NotImplementedError
+    _check(seed, temperature, spacing_mm)
+    sigmas = np.asarray(model.manifest.sigmas)
+    base = temperature * sigmas * np.random.default_rng(seed).standard_normal(len(sigmas))
+    latent = model.prior.from_base(base[None])[0]
+    gap = np.linalg.norm((model.population.base_codes - base) / sigmas, axis=1)
+    return SampledShape(
+        latent=latent,
+        log_density=float(model.prior.log_density(latent[None])[0][0]),
+        nearest_training_distance=float(gap.min()),
+        mesh=surface_of(model, latent, Pose(), spacing_mm),
+    )
+
+
+def _check(seed: int, temperature: float, spacing_mm: float | None) -> None:
+    if seed < 0:
+        raise InvalidParameter(f"seed is {seed}; a whole number from 0 is accepted.", part="seed")
+    if not 0.0 < temperature <= HIGHEST_TEMPERATURE:
+        raise InvalidParameter(
+            f"temperature is {temperature:g}; above 0 and at most {HIGHEST_TEMPERATURE:g} is accepted.",
+            part="temperature",
+        )
+    low, high = SPACING_RANGE_MM
+    if spacing_mm is not None and not low <= spacing_mm <= high:
+        raise InvalidParameter(
+            f"spacing_mm is {spacing_mm:g}; a grid step from {low:g} to {high:g} mm is accepted.", part="spacing_mm"
+        )

@@ -1,0 +1,81 @@
+"""Laplace approximation of the posterior over latent code and pose, and what follows from it on the surface.
+
+At the optimum the posterior is taken as Gaussian with the inverse curvature as covariance (MacKay 1992). Everything a
+user asks for is first order in the parameters: a logit moves by its Jacobian times the parameter step, and a surface
+point moves along its normal by that change over the length of the field's gradient.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
+
+from model.bundle import ShapeModel
+from model.inference.fitting import Fit
+
+#: Points evaluated in one call; bounds memory.
+CHUNK = 16384
+
+
+def laplace_covariance(fit: Fit) -> Float[np.ndarray, "p p"]:
+    """Inverse of the curvature at the optimum."""
+    return np.asarray(cho_solve(cho_factor(fit.precision), np.eye(len(fit.precision))))
+
+
+def fitted_logits(model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Occupancy logits of the fitted shape at world points (mm)."""
+    parts = [
+        model.decoder.logits(fit.latent[None], fit.pose.to_canonical(chunk)[None])[0] for chunk in _chunks(points)
+    ]
+    return np.concatenate(parts) if parts else np.zeros(0, np.float32)
+
+
+def fitted_jacobians(
+    model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n p"], Float[np.ndarray, "n 3"]]:
+    """Logits, their derivatives by (latent, pose step), and by world point (1/mm)."""
+    parts = [_jacobians(model, fit, chunk) for chunk in _chunks(points)]
+    logits, by_parameter, by_point = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return logits, by_parameter, by_point
+
+
+def _jacobians(
+    model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n p"], Float[np.ndarray, "n 3"]]:
+    canonical = fit.pose.to_canonical(points)
+    logits, by_latent, by_point = (
+        value[0] for value in model.decoder.logits_and_jacobians(fit.latent[None], canonical[None])
+    )
+    by_pose = fit.pose.jacobian(canonical, by_point)
+    return logits, np.concatenate([by_latent, by_pose], axis=1), fit.pose.gradient_to_world(by_point)
+
+
+def _chunks(points: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "m 3"]]:
+    return [points[start : start + CHUNK] for start in range(0, len(points), CHUNK)]
+
+
+def logit_variance(
+    by_parameter: Float[np.ndarray, "n p"], covariance: Float[np.ndarray, "p p"]
+) -> Float[np.ndarray, "n"]:
+    """Posterior variance of each logit, ``J C J^T``."""
+    return np.asarray(np.einsum("np,np->n", by_parameter @ covariance, by_parameter))
+
+
+def mean_probability(logits: Float[np.ndarray, "n"], variance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Expected sigmoid of a Gaussian logit (MacKay 1992, equation 10)."""
+    return np.asarray(1.0 / (1.0 + np.exp(-logits / np.sqrt(1.0 + np.pi * variance / 8.0))))
+
+
+def normal_displacements(
+    by_parameter: Float[np.ndarray, "v p"], by_point: Float[np.ndarray, "v 3"]
+) -> Float[np.ndarray, "v p"]:
+    """Outward movement of each surface point (mm) for a unit of each parameter."""
+    slope = np.linalg.norm(by_point, axis=1, keepdims=True)
+    return np.asarray(by_parameter / np.maximum(slope, 1e-6))
+
+
+def parameter_draws(covariance: Float[np.ndarray, "p p"], count: int, seed: int) -> Float[np.ndarray, "c p"]:
+    """Steps around the optimum drawn from the posterior, in antithetic pairs."""
+    half = np.random.default_rng(seed).standard_normal((count // 2, len(covariance)))
+    values, vectors = np.linalg.eigh(covariance)
+    steps = half * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+    return np.concatenate([steps, -steps])

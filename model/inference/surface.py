@@ -1,0 +1,54 @@
+"""Surface of a shape given by latent code and pose."""
+
+import numpy as np
+from jaxtyping import Float
+
+from model.bundle import ShapeModel
+from model.geometry import Grid, Pose
+from model.inference.isosurface import extract_surface
+from model.inference.mesh import Mesh, extents, transformed
+
+#: Room around the box of all training shapes in which a surface is looked for.
+BOX_MARGIN_MM = 6.0
+
+
+def surface_of(model: ShapeModel, latent: Float[np.ndarray, "d"], pose: Pose, step_mm: float | None = None) -> Mesh:
+    """Watertight surface in world mm, extracted in the canonical frame so that it turns with its input.
+
+    Args:
+        latent: (d,) latent code.
+        pose: world to canonical.
+        step_mm: grid step in world mm; the model's own when None.
+    """
+    half = canonical_box(model)
+    step = (step_mm or model.manifest.resolution_mm) * float(np.exp(pose.log_scale))
+
+    def field(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        return model.decoder.logits(latent[None], points[None])[0]
+
+    def gradient(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+        logits, _, by_point = model.decoder.logits_and_jacobians(latent[None], points[None])
+        return logits[0], by_point[0]
+
+    mesh = extract_surface(field, -half, half, step, gradient=gradient)
+    affine = np.eye(4)
+    affine[:3, :3] = np.linalg.inv(pose.linear)
+    affine[:3, 3] = pose.position
+    return transformed(mesh, affine)
+
+
+def canonical_box(model: ShapeModel) -> Float[np.ndarray, "3"]:
+    """Half size of the canonical box that is searched (mm)."""
+    return np.asarray(model.manifest.half_extent_mm, float) + BOX_MARGIN_MM
+
+
+def covering_grid(mesh: Mesh, spacing_mm: float, margin_mm: float = 5.0) -> Grid:
+    """Axis-aligned RAS grid around a mesh."""
+    lower, upper = extents(mesh)
+    lower, upper = lower - margin_mm, upper + margin_mm
+    shape = np.ceil((upper - lower) / spacing_mm).astype(int) + 1
+    affine = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
+    affine[:3, 3] = lower
+    return Grid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
+
+

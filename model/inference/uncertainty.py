@@ -1,0 +1,133 @@
+"""From the posterior to what users read: probability and entropy of voxels, SD of the surface, intervals.
+
+All spread on the surface comes from one matrix of displacement factors ``F`` (v, k): the outward movements of the
+vertices have covariance ``F F^T`` (mm^2), by the Laplace posterior or over an ensemble.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from model.bundle import ShapeModel
+from model.geometry import Grid
+from model.inference.fitting import Fit
+from model.inference.mesh import Mesh, area_cm2, area_gradient, vertex_areas, volume_ml
+from model.inference.posterior import (
+    fitted_jacobians,
+    fitted_logits,
+    logit_variance,
+    mean_probability,
+    normal_displacements,
+)
+from model.inference.surface import canonical_box
+
+#: Two-sided 90 % quantile of the normal distribution.
+NINETY_PERCENT = 1.6448536269514722
+#: Beyond this logit the posterior variance cannot move a probability visibly.
+SATURATED_LOGIT = 12.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure with its 90 % interval; `low` and `high` are None when uncertainty was not asked for."""
+
+    value: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class ShapeState:
+    """What is needed to evaluate the reconstructed field anywhere.
+
+    Attributes:
+        fits: the fit, followed by the ensemble's members if there are any.
+        covariance: (p, p) posterior covariance over (latent, pose step) of the first fit, or None.
+    """
+
+    fits: tuple[Fit, ...]
+    covariance: Float[np.ndarray, "p p"] | None
+
+    @property
+    def members(self) -> tuple[Fit, ...]:
+        """The ensemble's members."""
+        return self.fits[1:]
+
+
+def displacement_factors(model: ShapeModel, state: ShapeState, mesh: Mesh) -> Float[np.ndarray, "v k"] | None:
+    """Factors of the covariance of the vertices' outward movement (mm), or None without uncertainty."""
+    if state.covariance is not None:
+        _, by_parameter, by_point = fitted_jacobians(model, state.fits[0], mesh.vertices)
+        factor = np.linalg.cholesky(state.covariance)
+        return normal_displacements(by_parameter, by_point) @ factor
+    if state.members:
+        _, _, by_point = fitted_jacobians(model, state.fits[0], mesh.vertices)
+        logits = np.stack([fitted_logits(model, member, mesh.vertices) for member in state.members], axis=1)
+        moves = normal_displacements(logits, by_point)
+        return np.asarray((moves - moves.mean(axis=1, keepdims=True)) / np.sqrt(len(state.members) - 1))
+    return None
+
+
+def volume_estimate(mesh: Mesh, factors: Float[np.ndarray, "v k"] | None) -> Estimate:
+    """Enclosed volume (mL); a vertex that moves out by 1 mm adds its area."""
+    return _estimate(volume_ml(mesh), vertex_areas(mesh) / 1000.0, factors)
+
+
+def area_estimate(mesh: Mesh, factors: Float[np.ndarray, "v k"] | None) -> Estimate:
+    """Surface area (cm^2)."""
+    return _estimate(area_cm2(mesh), np.sum(area_gradient(mesh) * mesh.normals, axis=1) / 100.0, factors)
+
+
+def _estimate(value: float, slope: Float[np.ndarray, "v"], factors: Float[np.ndarray, "v k"] | None) -> Estimate:
+    if factors is None:
+        return Estimate(value, None, None)
+    reach = NINETY_PERCENT * float(np.linalg.norm(slope @ factors))
+    return Estimate(value, max(0.0, value - reach), value + reach)
+
+
+def occupancy(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndarray, "i j k"]:
+    """Posterior mean occupancy probability at the voxel centres of a grid; 0 outside the model's box."""
+    result = np.zeros(grid.shape, np.float32)
+    index, points = _voxels_in_box(model, state.fits[0], grid)
+    if len(points):
+        result[tuple(index.T)] = _probabilities(model, state, points)
+    return result
+
+
+def _probabilities(model: ShapeModel, state: ShapeState, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    if state.members:
+        return np.mean([_sigmoid(fitted_logits(model, member, points)) for member in state.members], axis=0)
+    logits = fitted_logits(model, state.fits[0], points)
+    result = _sigmoid(logits)
+    open_points = np.abs(logits) < SATURATED_LOGIT
+    if state.covariance is not None and open_points.any():
+        centre, by_parameter, _ = fitted_jacobians(model, state.fits[0], points[open_points])
+        result[open_points] = mean_probability(centre, logit_variance(by_parameter, state.covariance))
+    return result
+
+
+def _voxels_in_box(
+    model: ShapeModel, found: Fit, grid: Grid
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Indices and world positions of the voxels that lie in the model's canonical box."""
+    half = canonical_box(model)
+    corners = half * np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    reach = grid.to_index(found.pose.to_world(corners))
+    low = np.clip(np.floor(reach.min(axis=0)), 0, grid.shape).astype(int)
+    high = np.clip(np.ceil(reach.max(axis=0)) + 1, 0, grid.shape).astype(int)
+    axes = [np.arange(a, max(a, b)) for a, b in zip(low, high, strict=True)]
+    index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = grid.to_world(index)
+    inside: Bool[np.ndarray, "n"] = (np.abs(found.pose.to_canonical(points)) <= half).all(axis=1)
+    return index[inside], points[inside]
+
+
+def voxel_entropy(probability: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
+    """Entropy of a Bernoulli variable (nats), 0 to ln 2."""
+    p = np.clip(probability.astype(float), 1e-12, 1.0 - 1e-12)
+    return np.asarray(-(p * np.log(p) + (1.0 - p) * np.log1p(-p)), dtype=np.float32)
+
+
+def _sigmoid(logits: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    return np.asarray(1.0 / (1.0 + np.exp(-logits.astype(float))))

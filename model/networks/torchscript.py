@@ -1,0 +1,78 @@
+"""Decoder and prior of a bundle on TorchScript: the second implementation behind `model.backends`."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+class ScriptDecoder:
+    """A bundle's decoder; see `model.backends.Decoder`."""
+
+    def __init__(self, folder: Path, latent_size: int) -> None:
+        self.latent_size = latent_size
+        self._logits = torch.jit.load(folder / "decoder_logits.pt")
+        self._jacobians = torch.jit.load(folder / "decoder_jacobians.pt")
+
+    def logits(self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n"]:
+        """See `model.backends.Decoder`."""
+        with torch.no_grad():
+            return _array(self._logits(_tensor(latent), _tensor(points)))
+
+    def logits_and_jacobians(
+        self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]
+    ) -> tuple[Float[np.ndarray, "b n"], Float[np.ndarray, "b n d"], Float[np.ndarray, "b n 3"]]:
+        """See `model.backends.Decoder`."""
+        with torch.no_grad():
+            logits, by_latent, by_point = self._jacobians(_tensor(latent), _tensor(points))
+        return _array(logits), _array(by_latent), _array(by_point)
+
+
+class ScriptPrior:
+    """A bundle's prior; see `model.backends.Prior`."""
+
+    def __init__(self, folder: Path, latent_size: int) -> None:
+        self.latent_size = latent_size
+        self._density = torch.jit.load(folder / "prior_density.pt")
+        count = len(list(folder.glob("prior_sampling_*.pt")))
+        self._steps = [torch.jit.load(folder / f"prior_sampling_{k}.pt") for k in range(count)]
+
+    def log_density(self, latent: Float[np.ndarray, "b d"]) -> tuple[Float[np.ndarray, "b"], Float[np.ndarray, "b d"]]:
+        """See `model.backends.Prior`."""
+        code = _tensor(latent).requires_grad_(True)
+        density, _ = self._density(code)
+        (gradient,) = torch.autograd.grad(density.sum(), code)
+        return _array(density), _array(gradient)
+
+    def to_base(self, latent: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
+        """See `model.backends.Prior`."""
+        with torch.no_grad():
+            return _array(self._density(_tensor(latent))[1])
+
+    def from_base(self, base: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
+        """See `model.backends.Prior`."""
+        value = _tensor(base)
+        with torch.no_grad():
+            for step in reversed(self._steps):
+                guess = value
+                for _ in range(value.shape[1]):
+                    guess = step(value, guess)
+                value = guess
+        return _array(value)
+
+
+def load(folder: Path, latent_size: int, threads: int | None) -> tuple[ScriptDecoder, ScriptPrior]:
+    """Decoder and prior of a bundle."""
+    if threads:
+        torch.set_num_threads(threads)
+    return ScriptDecoder(folder, latent_size), ScriptPrior(folder, latent_size)
+
+
+def _tensor(values: Float[np.ndarray, "..."]) -> Tensor:
+    return torch.as_tensor(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def _array(values: Tensor) -> Float[np.ndarray, "..."]:
+    return np.asarray(values.detach().numpy())
