@@ -8,6 +8,8 @@ native parser meets what a stranger sent.
 
 from typing import BinaryIO, Literal
 
+import numpy as np
+
 from model.errors import UnreadableImage
 from model.inference.observations import MaskStack
 from model.inference.stacks import checked_labels, make_stack
@@ -35,7 +37,8 @@ def read_mask(source: Source, part: str, limits: ImageLimits, labels: frozenset[
         InvalidGeometry, InvalidMask, InvalidParameter: see `model.inference.stacks.make_stack`.
     """
     checked_labels(labels)
-    with opened(source, part, limits) as file:
+    # Affines from hostile headers may overflow on the way; make_stack refuses what comes of it.
+    with opened(source, part, limits) as file, np.errstate(all="ignore"):
         volume = _read(file, part, limits, labels_named=labels is not None)
     return make_stack(part, volume.values, volume.affine, labels)
 
