@@ -10,6 +10,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from fastapi.routing import APIRoute
 from fastapi_offline import FastAPIOffline
 
 from service.adapters.images import ImageLimits, read_mask, write_nifti
@@ -64,6 +65,7 @@ def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log
     )
     app = FastAPIOffline(
         redoc_url=None,
+        generate_unique_id_function=operation_name,
         title=TITLE,
         version=INTERFACE_VERSION,
         description=DESCRIPTION,
@@ -81,7 +83,9 @@ def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log
 
 def interface_document() -> dict[str, Any]:
     """The interface's description, the same for all settings and models."""
-    app = FastAPI(title=TITLE, version=INTERFACE_VERSION, description=DESCRIPTION)
+    app = FastAPI(
+        title=TITLE, version=INTERFACE_VERSION, description=DESCRIPTION, generate_unique_id_function=operation_name
+    )
     _add_routes(app)
     return app.openapi()
 
@@ -98,6 +102,11 @@ def program_version() -> str:
         return installed_version("morphoflow")
     except PackageNotFoundError:
         return "0+unknown"
+
+
+def operation_name(route: APIRoute) -> str:
+    """Name of an operation in the interface's description."""
+    return route.name
 
 
 def _add_routes(app: FastAPI) -> None:

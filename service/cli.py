@@ -24,6 +24,8 @@ PROGRAM = "morphoflow"
 COMMAND_GROUP = "morphoflow.commands"
 BAD_INPUT, FAULT = 2, 1
 
+VersionOption = Annotated[bool, typer.Option("--version", help="Print the version.")]
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit status."""
@@ -49,12 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def build_app() -> typer.Typer:
     """The commands of the service."""
     app = typer.Typer(
-        help="Complete 3-D anatomy, with its uncertainty, from a few annotated slices.",
-        no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
     )
-    app.callback()(_program)
+    app.callback(invoke_without_command=True)(_program)
     for command in (serve, reconstruct, sample, models, openapi):
         app.command()(command)
     return app
@@ -125,11 +125,10 @@ def example_request(settings: Settings) -> str:
     return f"curl {key}-H 'Accept: model/stl' -F mask=@mask.nii.gz -o surface.stl {url}"
 
 
-def _program(
-    version: Annotated[bool, typer.Option("--version", is_eager=True, help="Print the version.")] = False,
-) -> None:
-    if version:
-        typer.echo(program_version())
+def _program(context: typer.Context, version: VersionOption = False) -> None:
+    """Complete 3-D anatomy, with its uncertainty, from a few annotated slices."""
+    if version or context.invoked_subcommand is None:
+        typer.echo(program_version() if version else context.get_help())
         raise typer.Exit
 
 

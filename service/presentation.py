@@ -4,7 +4,7 @@ import math
 
 from model.bundle import ShapeModel
 from model.inference.observations import Plane
-from model.inference.reconstruction import Estimate
+from model.inference.uncertainty import Estimate
 from service.ports import Outcome, StoredResult
 from service.schemas import (
     ActiveDimensions,

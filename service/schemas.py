@@ -141,7 +141,7 @@ class ResidualSchema(BaseModel):
     """How far a drawn plane and the reconstruction disagree."""
 
     plane: PlaneSchema
-    disagreement: float = Field(description="share of the plane's weight on the wrong side of the surface, 0 to 1")
+    disagreement: float = Field(description="1 - Dice between the drawing and the reconstruction's section, 0 to 1")
     mean_error: float = Field(description="mean of label minus probability")
 
 

@@ -11,16 +11,11 @@ from model.errors import InvalidParameter, TooLarge
 from model.geometry import Grid, Pose
 from model.inference.fitting import Fit, FitStatus
 from model.inference.observations import MaskStack
-from model.inference.reconstruction import (
-    Options,
-    ShapeState,
-    Watch,
-    covering_grid,
-    occupancy,
-    voxel_entropy,
-)
+from model.inference.reconstruction import Options, Watch
 from model.inference.reconstruction import reconstruct as infer
 from model.inference.sampling import SampledShape, draw_shape
+from model.inference.surface import covering_grid
+from model.inference.uncertainty import ShapeState, occupancy, voxel_entropy
 from service.errors import NotComputed
 from service.ports import Catalogue, Outcome, ResultStore, StoredResult
 

@@ -15,7 +15,8 @@ from model.geometry import Grid, Pose
 from model.inference.fitting import Fit, FitStatus
 from model.inference.mesh import Mesh
 from model.inference.observations import Plane
-from model.inference.reconstruction import Estimate, Options, PlaneResidual, Reconstruction, ShapeState
+from model.inference.reconstruction import Options, PlaneResidual, Reconstruction
+from model.inference.uncertainty import Estimate, ShapeState
 from service.ports import Outcome
 
 SUMMARY, STATE, MESH = "summary.json", "state.npz", "mesh.npz"

@@ -1,0 +1,68 @@
+"""One broken model does not stop the others."""
+
+import pytest
+
+from model.errors import BundleCorrupt, BundleIncomplete, InvalidParameter, UnknownModel
+from service.model_registry import MANIFEST, ModelRegistry, find_bundles, load_models
+from tests.analytic_model import ellipsoid_model
+
+
+def opener(found):
+    def open_model(folder):
+        answer = found[folder.name]
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    return open_model
+
+
+def test_broken_bundles_are_reported_beside_the_loaded_ones(tmp_path):
+    found = {"a": ellipsoid_model("a"), "b": BundleCorrupt("weights.onnx differs."), "c": ellipsoid_model("c")}
+    found["d"] = OSError("/secret/path")
+    registry = load_models([tmp_path / name for name in found], opener(found))
+    assert registry.names() == ("a", "c")
+    assert [item.name for item in registry.broken] == ["b", "d"]
+    assert not any("/secret" in item.reason for item in registry.broken)
+
+
+def test_of_two_models_with_one_name_the_first_stays(tmp_path):
+    first, second = ellipsoid_model("a"), ellipsoid_model("a", (5.0, 5.0, 5.0))
+    registry = load_models([tmp_path / "x", tmp_path / "y"], opener({"x": first, "y": second}))
+    assert registry.get("a") is first
+    assert [item.name for item in registry.broken] == ["y"]
+
+
+def test_the_only_model_needs_no_name():
+    only = ellipsoid_model("a")
+    assert ModelRegistry({"a": only}).get(None) is only
+
+
+@pytest.mark.parametrize("names", [(), ("a", "b")])
+def test_without_a_name_there_must_be_exactly_one(names):
+    with pytest.raises(InvalidParameter) as caught:
+        ModelRegistry({name: ellipsoid_model(name) for name in names}).get(None)
+    assert caught.value.part == "model"
+    assert all(name in str(caught.value) for name in names)
+
+
+def test_an_unknown_name_is_told_the_known_ones():
+    with pytest.raises(UnknownModel, match="hip"):
+        ModelRegistry({"hip": ellipsoid_model("hip")}).get("hop")
+
+
+def test_a_folder_is_a_bundle_or_holds_bundles(tmp_path):
+    for name in ("b", "a"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / MANIFEST).write_text("{}")
+    (tmp_path / "half").mkdir()
+    (tmp_path / "file").write_text("")
+    (tmp_path / ".hidden").mkdir()
+    assert [folder.name for folder in find_bundles(tmp_path)] == ["a", "b", "half"]
+    assert list(find_bundles(tmp_path / "a")) == [tmp_path / "a"]
+    assert list(find_bundles(tmp_path / "nowhere")) == []
+
+
+def test_a_folder_without_a_manifest_counts_as_broken(tmp_path):
+    registry = load_models([tmp_path / "half"], opener({"half": BundleIncomplete("manifest.json is missing.")}))
+    assert registry.broken[0].reason == "manifest.json is missing."
