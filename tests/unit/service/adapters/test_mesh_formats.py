@@ -202,7 +202,7 @@ def test_no_metadata_breaks_a_file(text):
     box = from_trimesh(trimesh.creation.box())
     box = box.with_scalars(surface_sd_mm=np.arange(8.0))
     for format in FORMATS:
-        _, faces, _, _ = READERS[format](write_mesh(mesh, format, metadata={"note": text}))
+        _, faces, _, _ = READERS[format](write_mesh(box, format, metadata={"note": text}))
         assert len(faces) == 12
 
 
