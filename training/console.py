@@ -9,23 +9,26 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from model.errors import BundleError, CohortError, InputError, InvalidParameter, MorphoFlowError, NotFound
+from model.errors import CohortError, InputError, InvalidParameter, MorphoFlowError, NotFound
 from training.cohorts import Cohort, CohortName, CohortOptions, data_folder, load_cohort, read_folder
 
 #: Errors that the caller can mend.
-BAD_INPUT = (InputError, CohortError, NotFound, BundleError)
-BAD_INPUT_STATUS = 2
-FAULT_STATUS = 1
+BAD_INPUT = (InputError, CohortError, NotFound)
+BAD_INPUT_STATUS, FAULT_STATUS = 2, 1
 
 
 @contextmanager
 def exit_status() -> Iterator[None]:
-    """Turn the project's errors into a sentence on standard error and an exit status."""
+    """Turn the project's errors, and libraries that are not there, into a sentence and an exit status."""
     try:
         yield
     except MorphoFlowError as error:
-        typer.echo(f"Error: {error}", err=True)
+        typer.echo(f"morphoflow: {error}", err=True)
         raise typer.Exit(BAD_INPUT_STATUS if isinstance(error, BAD_INPUT) else FAULT_STATUS) from error
+    except ModuleNotFoundError as error:
+        library = (error.name or "a library").split(".")[0]
+        typer.echo(f"morphoflow: this command needs {library}: pip install 'morphoflow[training]'", err=True)
+        raise typer.Exit(BAD_INPUT_STATUS) from error
 
 
 @contextmanager

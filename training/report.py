@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TextIO
+from io import TextIOBase
 
 import numpy as np
 
@@ -78,7 +78,7 @@ def as_json(rows: Sequence[Row]) -> str:
     return json.dumps([_finite(asdict(row)) for row in rows], indent=2)
 
 
-def write_csv(measurements: Sequence[Measurement], stream: TextIO) -> None:
+def write_csv(measurements: Sequence[Measurement], stream: TextIOBase) -> None:
     """Every measurement as a line."""
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["case", "regime", "method", *FIGURES, "seconds", "refusal"])

@@ -1,0 +1,100 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from model.errors import InvalidParameter
+from model.geometry import Grid
+from model.networks.decoder import DecoderShape
+from model.networks.flow import FlowShape
+from model.networks.prior import PriorShape
+from tests.analytic_shapes import Ellipsoid
+from training.cohorts import Case, Cohort, Provenance
+from training.config import TrainingConfig
+from training.release import active_dimensions
+from training.runs import half_extent, mask_digest, read_record, train_cohort
+
+GRID = Grid((24, 24, 24), np.diag([1.0, 1.0, 1.0, 1.0]))
+CONFIG = TrainingConfig(
+    decoder=DecoderShape(latent_size=4, width=16, depth=3),
+    prior=PriorShape(FlowShape(latent_size=4, width=8)),
+    regime="thin",
+    steps=24,
+    batch_shapes=3,
+    checkpoint_every=8,
+)
+
+
+class Interrupted(Exception):
+    """Stands for a killed process."""
+
+
+def ellipsoids(count=4):
+    centre = np.full(3, 11.5)
+    shapes = [Ellipsoid((6.0 + 0.5 * n, 7.0, 8.0 - 0.4 * n), centre) for n in range(count)]
+    cases = tuple(Case(f"e{n}", f"e{n}", "train", shape.mask(GRID), GRID) for n, shape in enumerate(shapes))
+    return Cohort("ellipsoids", cases, (), (), (), Provenance("made here", "CC0", "nobody", shippable=True))
+
+
+def test_an_interrupted_run_ends_as_an_unbroken_one(tmp_path):
+    def interrupt(step, _figures):
+        if step == 19:
+            raise Interrupted
+
+    unbroken = train_cohort(ellipsoids(), CONFIG, tmp_path / "one")
+    with pytest.raises(Interrupted):
+        train_cohort(ellipsoids(), CONFIG, tmp_path / "two", watch=interrupt)
+    steps = []
+    resumed = train_cohort(
+        ellipsoids(), CONFIG, tmp_path / "two", resume=True, watch=lambda step, figures: steps.append(step)
+    )
+    assert steps == list(range(17, 25))
+    for name, value in unbroken.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name
+
+
+def test_a_run_is_not_written_over(tmp_path):
+    train_cohort(ellipsoids(), CONFIG, tmp_path)
+    with pytest.raises(InvalidParameter, match="--resume"):
+        train_cohort(ellipsoids(), CONFIG, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("cohort", "config"), [(ellipsoids(3), CONFIG), (ellipsoids(), replace(CONFIG, learning_rate=0.1))]
+)
+def test_a_run_of_other_masks_or_settings_is_not_continued(tmp_path, cohort, config):
+    train_cohort(ellipsoids(), CONFIG, tmp_path)
+    with pytest.raises(InvalidParameter, match="other masks or settings"):
+        train_cohort(cohort, config, tmp_path, resume=True)
+
+
+def test_the_record_gives_the_configuration_back(tmp_path):
+    train_cohort(ellipsoids(), CONFIG, tmp_path)
+    config, record = read_record(tmp_path)
+    assert config == replace(CONFIG, decoder=config.decoder)
+    assert config.decoder.extent_mm >= 8.0
+    assert list(record["train"]) == [f"e{n}" for n in range(4)]
+    with pytest.raises(InvalidParameter, match="no training run"):
+        read_record(tmp_path / "elsewhere")
+
+
+def test_a_digest_depends_on_voxels_and_place():
+    case = ellipsoids().train[0]
+    moved = replace(case, grid=Grid(GRID.shape, np.diag([1.0, 1.0, 2.0, 1.0])))
+    other = replace(case, mask=~case.mask)
+    assert mask_digest(case) == mask_digest(replace(case, name="renamed"))
+    assert len({mask_digest(found) for found in (case, moved, other)}) == 3
+
+
+def test_the_half_extent_holds_every_shape():
+    found = half_extent(ellipsoids())
+    assert np.all(np.abs(np.array(found) - [7.5, 7.0, 8.0]) <= 0.5)
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "expected"), [([1.0] * 100, (95, 97, 99)), ([10.0, 1e-3, 1e-3], (1, 1, 1)), ([1.0, 1.0], (2, 2, 2))]
+)
+def test_active_dimensions_hold_their_share_of_the_variance(sigmas, expected):
+    assert active_dimensions(np.array(sigmas)) == expected
+    assert active_dimensions(np.array(sigmas)[::-1].copy()) == expected
