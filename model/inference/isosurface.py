@@ -17,7 +17,7 @@ from scipy import ndimage
 from skimage import measure
 
 from model.errors import InvalidParameter
-from model.inference.mesh import Mesh, empty_mesh, largest_component, mesh_of, unit
+from model.inference.mesh import Mesh, empty_mesh, is_watertight, largest_component, mesh_of, unit
 
 #: Positive inside, negative outside; points in mm.
 Field = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
@@ -27,10 +27,12 @@ FieldWithGradient = Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray,
 #: Node values this close to zero, in shares of the typical value beside the surface, count as that
 #: far away: a vertex exactly on a node would make degenerate faces.
 NODE_CLEARANCE = 1e-3
-#: How far from a cell's corners the surface is looked for without a sign change, in cell sizes: on the
-#: coarsest level everywhere (half a diagonal), later only as far as spares a round of following the surface.
+#: The coarsest grid has at least this many cells along each axis, so that no limb of an object is lost.
+COARSE_CELLS = 12
+#: How far from a cell's corners the surface is looked for without a sign change, in cell sizes: everywhere
+#: (half a diagonal), in the last step only as far as spares a round of following the surface.
 COARSE_REACH = 3**0.5 / 2
-FINE_REACH = 0.3
+FINEST_REACH = 0.3
 
 
 class Refinement:
@@ -97,9 +99,10 @@ class Refinement:
 
     def _refine(self) -> None:
         """Halve the step."""
-        cells, reach = _mixed(self._values > 0, 1), FINE_REACH
-        if self._refined is None:
-            cells, reach = ndimage.binary_dilation(cells, np.ones((3, 3, 3), bool)), COARSE_REACH
+        cells, coarsest = _mixed(self._values > 0, 1), self._refined is None
+        if coarsest:
+            cells = ndimage.binary_dilation(cells, np.ones((3, 3, 3), bool))
+        reach = FINEST_REACH if self._stride == 2 and not coarsest else COARSE_REACH
         self._refined = cells | _within_reach(self._values, reach)
         self._stride //= 2
         self._floods = 0
@@ -116,7 +119,7 @@ def extract_surface(
     upper: Float[np.ndarray, "3"],
     step_mm: float,
     *,
-    coarse_factor: int = 4,
+    coarse_factor: int | None = None,
     gradient: FieldWithGradient | None = None,
     keep_specks: bool = False,
 ) -> Mesh:
@@ -130,7 +133,7 @@ def extract_surface(
         field: values at points (mm), positive inside.
         lower, upper: corners of the box (mm).
         step_mm: distance of the finest nodes.
-        coarse_factor: coarsest step in finest steps, a power of two.
+        coarse_factor: coarsest step in finest steps, a power of two; by the size of the box when None.
         gradient: values and gradients at points; moves the vertices onto the surface and gives the normals.
         keep_specks: keep all components; only the one of largest volume otherwise (`largest_component`
             counts those that go).
@@ -141,7 +144,7 @@ def extract_surface(
     Raises:
         InvalidParameter: a step, box or factor that no grid can have.
     """
-    refinement = Refinement(lower, upper, step_mm, coarse_factor)
+    refinement = Refinement(lower, upper, step_mm, coarse_factor or _coarse_factor(lower, upper, step_mm))
     while len(points := refinement.query()):
         refinement.update(field(points))
     mesh = polygonise(refinement.grid(), lower, step_mm)
@@ -168,10 +171,18 @@ def polygonise(values: Float[np.ndarray, "i j k"], lower: Float[np.ndarray, "3"]
     for axis in range(3):
         border = np.moveaxis(padded, axis, 0)
         border[[0, -1]] = -np.abs(border[[0, -1]])
+    origin = np.asarray(lower, float) + (first - 1) * step_mm
+    mesh = _marching_cubes(padded, origin, step_mm)
+    if not is_watertight(mesh):
+        _bridge(padded)
+        mesh = _marching_cubes(padded, origin, step_mm)
+    return mesh
+
+
+def _marching_cubes(values: Float[np.ndarray, "i j k"], origin: Float[np.ndarray, "3"], step_mm: float) -> Mesh:
     marching_cubes: Any = measure.marching_cubes
-    corners, faces, _, _ = marching_cubes(padded, 0.0, method="lewiner", gradient_direction="ascent")
-    vertices = np.asarray(lower, float) + (corners.astype(float) + first - 1) * step_mm
-    return mesh_of(vertices, faces.astype(np.int64))
+    corners, faces, _, _ = marching_cubes(values, 0.0, method="lewiner", gradient_direction="ascent")
+    return mesh_of(origin + corners.astype(float) * step_mm, faces.astype(np.int64))
 
 
 def _settled(
@@ -189,6 +200,12 @@ def _settled(
     uphill = unit(slopes.astype(float))
     vertices = mesh.vertices + np.clip(size, -step_mm / 2, step_mm / 2)[:, None] * uphill
     return replace(mesh, vertices=vertices, normals=np.where(free[:, None], -uphill, mesh.normals))
+
+
+def _coarse_factor(lower: np.ndarray, upper: np.ndarray, step_mm: float) -> int:
+    """The largest of 1, 2, 4, 8 that leaves `COARSE_CELLS` cells along the shortest axis of the box."""
+    cells = float(np.min(upper - lower)) / step_mm if step_mm > 0 else 0.0
+    return max((factor for factor in (2, 4, 8) if cells >= COARSE_CELLS * factor), default=1)
 
 
 def _check(lower: np.ndarray, upper: np.ndarray, step_mm: float, coarse_factor: int) -> None:
@@ -263,6 +280,27 @@ def _bounds(inside: Bool[np.ndarray, "i j k"]) -> tuple[np.ndarray, np.ndarray]:
         first.append(max(occupied[0] - 1, 0))
         last.append(min(occupied[-1] + 2, inside.shape[axis]))
     return np.array(first), np.array(last)
+
+
+def _bridge(values: Float[np.ndarray, "i j k"]) -> None:
+    """Make node values positive, in place, until no face of a cell has its signs in a checkerboard.
+
+    Of the two negative corners of such a face the one closer to zero changes. Where two cells meet in such
+    a face, marching cubes can join four triangles in one edge; this happens in noise at the scale of the grid.
+    """
+    clearance = np.float32(np.abs(values).min())
+    changed = True
+    while changed:
+        changed = False
+        for first, second in ((0, 1), (0, 2), (1, 2)):
+            faces = np.moveaxis(values, (first, second), (0, 1))
+            for face in (faces, faces[::-1]):
+                a, b, c, d = face[:-1, :-1], face[1:, 1:], face[:-1, 1:], face[1:, :-1]
+                crossed = (a < 0) & (b < 0) & (c > 0) & (d > 0)
+                changed = changed or bool(crossed.any())
+                closer = a >= b
+                a[crossed & closer] = clearance
+                b[crossed & ~closer] = clearance
 
 
 def _cleared(values: Float[np.ndarray, "i j k"]) -> Float[np.ndarray, "i j k"]:

@@ -98,7 +98,8 @@ def _stl(mesh: Mesh, said: Mapping[str, str]) -> bytes:
 
 
 def _obj(mesh: Mesh, said: Mapping[str, str]) -> bytes:
-    header = "\n# ".join(f"{key} {value}" for key, value in said.items())
+    # A backslash or a blank at the end of a comment would take the next line into it.
+    header = "\n# ".join(f"{key} {value}".replace("\\", "/").strip() for key, value in said.items())
     write: Any = export_obj
     text: str = write(to_trimesh(mesh), include_normals=True, digits=6, header=header)
     return text.encode()

@@ -32,16 +32,6 @@ def dense(field, step):
     return largest_component(polygonise(values, LOW, step))[0]
 
 
-def vertices_are_manifold(mesh):
-    """Each vertex's faces form one closed fan: splitting the vertices by fan makes no new ones."""
-    whole = to_trimesh(mesh)
-    return (
-        whole.is_watertight
-        and whole.is_winding_consistent
-        and all(part.is_watertight for part in whole.split(only_watertight=False))
-    )
-
-
 SHAPES = {
     "ellipsoid": Ellipsoid((7.0, 9.0, 20.0), np.array(CENTRE), TURN).logits,
     "saturated ellipsoid": lambda p: 8.0 * np.tanh(Ellipsoid((7.0, 9.0, 20.0)).logits(p) / 2.0),
@@ -54,7 +44,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("name", SHAPES)
-@pytest.mark.parametrize("factor", [2, 4])
+@pytest.mark.parametrize("factor", [None, 2, 4, 8])
 def test_refinement_finds_the_surface_of_the_dense_grid(name, factor):
     field, calls = counted(SHAPES[name])
     mesh = extract_surface(field, LOW, HIGH, 1.0, coarse_factor=factor)
@@ -117,7 +107,6 @@ def test_object_through_the_border_is_capped(with_gradient):
     box = np.full(3, 8.0)
     gradient = ball.logits_and_gradients if with_gradient else None
     mesh = extract_surface(ball.logits, -box, box, 1.0, gradient=gradient)
-    assert vertices_are_manifold(mesh)
     assert is_watertight(mesh)
     assert volume_ml(mesh) > 0
     assert (np.abs(mesh.vertices) <= 8.5 + 1e-9).all()
@@ -154,11 +143,17 @@ def test_everything_inside_gives_the_box():
     np.testing.assert_allclose([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)], [LOW - 2.0, HIGH + 2.0])
 
 
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.7, 1.2]), st.booleans())
-def test_noise_gives_closed_manifold_surfaces(seed, blur, whole_numbers):
+ROUNDED = {
+    "as it is": lambda values: values,
+    "whole numbers": lambda values: np.round(2.0 * values / values.std()),
+    "signs": np.sign,
+}
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.7, 1.2]), st.sampled_from(sorted(ROUNDED)))
+def test_noise_gives_closed_manifold_surfaces(seed, blur, rounding):
     values = gaussian_filter(np.random.default_rng(seed).normal(size=(9, 8, 7)), blur)
-    values = np.round(2.0 * values / values.std()) if whole_numbers else values
-    mesh = polygonise(values.astype(np.float32), np.zeros(3), 1.0)
+    mesh = polygonise(ROUNDED[rounding](values).astype(np.float32), np.zeros(3), 1.0)
     assert is_watertight(mesh)
     assert volume_ml(mesh) > 0
 
