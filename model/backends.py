@@ -42,6 +42,12 @@ class Prior(Protocol):
         """``z0 = g(z)``."""
         ...
 
+    def base_jacobian(
+        self, latent: Float[np.ndarray, "b d"]
+    ) -> tuple[Float[np.ndarray, "b d"], Float[np.ndarray, "b d d"]]:
+        """``z0`` and ``dz0/dz``."""
+        ...
+
     def from_base(self, base: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
         """``z = g^-1(z0)``."""
         ...
@@ -73,6 +79,7 @@ class OnnxPrior:
     def __init__(self, folder: Path, latent_size: int, threads: int | None) -> None:
         self.latent_size = latent_size
         self._density = _session(folder / "prior_density.onnx", threads)
+        self._jacobian = _session(folder / "prior_base_jacobian.onnx", threads)
         self._steps = [_session(path, threads) for path in _numbered(folder, ".onnx")]
 
     def log_density(self, latent: Float[np.ndarray, "b d"]) -> tuple[Float[np.ndarray, "b"], Float[np.ndarray, "b d"]]:
@@ -83,6 +90,13 @@ class OnnxPrior:
     def to_base(self, latent: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
         """See `Prior`."""
         return _run(self._density, latent=latent)[2]
+
+    def base_jacobian(
+        self, latent: Float[np.ndarray, "b d"]
+    ) -> tuple[Float[np.ndarray, "b d"], Float[np.ndarray, "b d d"]]:
+        """See `Prior`."""
+        base, jacobian = _run(self._jacobian, latent=latent)
+        return base, jacobian
 
     def from_base(self, base: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
         """See `Prior`."""

@@ -49,13 +49,13 @@ class TrainingConfig:
     prior: PriorShape = field(default_factory=lambda: PriorShape(FlowShape()))
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     regime: Regime = "dense"
-    steps: int = 6000
+    steps: int = 8000
     batch_shapes: int = 32
     near_points: int = 192
     far_points: int = 64
     learning_rate: float = 2e-3
     code_learning_rate: float = 1e-2
-    flow_learning_rate: float = 1e-3
+    flow_learning_rate: float = 3e-4
     weight_decay: float = 1e-4
     warm_up: float = 0.03
     flow_start: float = 0.3

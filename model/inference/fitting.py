@@ -2,12 +2,14 @@
 
 The objective is the negative log posterior
 
-    E(z, pose) = lambda * sum_n w_n BCE(logit_n, y_n) - log p(z) - log p(pose)
+    E(z, pose) = lambda * sum_n w_n BCE(logit_n, y_n) + 1/2 |z0(z) / sigma|^2 - log p(pose)
 
 over observations with weights ``w_n`` (mm^2 of annotated plane) and likelihood precision ``lambda`` (1/mm^2; neighbouring
 voxels are not independent, so it is calibrated on validation shapes). Each evaluation gives logits with their Jacobians
-by latent code and point; the pose's follow by the chain rule. Curvature is Fisher's, ``lambda w p (1 - p) J J^T``, plus that
-of the priors (Levenberg 1944, Marquardt 1963).
+by latent code and point; the pose's follow by the chain rule. The prior's mode is taken in the flow's base coordinates
+``z0 = g(z)``, where it is Gaussian: that makes it a sum of squares with Jacobian ``dz0/dz``, and the whole a Gauss-Newton
+problem with curvature ``lambda w p (1 - p) J J^T`` plus ``(dz0/dz)^T diag(1/sigma^2) dz0/dz`` (Levenberg 1944,
+Marquardt 1963). The density's own mode in ``z`` would follow every ripple of the splines' determinant.
 """
 
 from collections.abc import Sequence
@@ -17,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from model.bundle import ShapeModel
@@ -106,7 +108,7 @@ class _Objective:
         self._pose_precision = 1.0 / np.square(
             [options.position_sd_mm] * 3 + [options.rotation_sd] * 3 + [options.log_scale_sd]
         )
-        self._code_precision = np.square(1.0 / np.asarray(model.manifest.sigmas))
+        self._sigmas = np.asarray(model.manifest.sigmas)
 
     def at(self, latent: Float[np.ndarray, "d"], pose: Pose, sharpness: float = 1.0) -> _Point:
         """Evaluate; logits are multiplied by `sharpness` (below 1 widens the basin of attraction)."""
@@ -129,12 +131,13 @@ class _Objective:
         return self._with_priors(point)
 
     def _with_priors(self, point: _Point) -> _Point:
-        density, by_latent = self._model.prior.log_density(point.latent[None])
+        base, by_latent = (part[0].astype(float) for part in self._model.prior.base_jacobian(point.latent[None]))
+        whitened, slope = base / self._sigmas, by_latent / self._sigmas[:, None]
         offset = pose_offset(self._start, point.pose)
         pull = self._pose_precision * offset
-        gradient = point.gradient + np.concatenate([-by_latent[0], pull])
-        curvature = point.curvature + np.diag(np.concatenate([self._code_precision, self._pose_precision]))
-        value = point.value - float(density[0]) + 0.5 * float(pull @ offset)
+        gradient = point.gradient + np.concatenate([slope.T @ whitened, pull])
+        curvature = point.curvature + block_diag(slope.T @ slope, np.diag(self._pose_precision))
+        value = point.value + 0.5 * float(whitened @ whitened) + 0.5 * float(pull @ offset)
         return replace(point, value=value, gradient=gradient, curvature=curvature)
 
 

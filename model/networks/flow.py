@@ -28,9 +28,9 @@ class FlowShape:
 
     latent_size: int = 64
     transforms: int = 2
-    bins: int = 6
-    width: int = 64
-    bound: float = 5.0
+    bins: int = 4
+    width: int = 32
+    bound: float = 4.0
 
 
 class MaskedLinear(nn.Linear):

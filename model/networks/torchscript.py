@@ -51,6 +51,15 @@ class ScriptPrior:
         with torch.no_grad():
             return _array(self._density(_tensor(latent))[1])
 
+    def base_jacobian(
+        self, latent: Float[np.ndarray, "b d"]
+    ) -> tuple[Float[np.ndarray, "b d"], Float[np.ndarray, "b d d"]]:
+        """See `model.backends.Prior`; every row of the Jacobian from its own copy of the code."""
+        copies = _tensor(np.repeat(latent, self.latent_size, axis=0)).requires_grad_(True)
+        base = self._density(copies)[1].unflatten(0, (-1, self.latent_size))
+        (jacobian,) = torch.autograd.grad(base.diagonal(dim1=1, dim2=2).sum(), copies)
+        return _array(base[:, 0]), _array(jacobian.unflatten(0, (-1, self.latent_size)))
+
     def from_base(self, base: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
         """See `model.backends.Prior`."""
         value = _tensor(base)
