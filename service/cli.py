@@ -15,7 +15,8 @@ import yaml
 
 from model.errors import CohortError, InputError, MorphoFlowError, NotFound
 from service.app import create_app, interface_document, program_version
-from service.commands import models, reconstruct, sample
+from service.commands import OpenRegistry, models, reconstruct, sample
+from service.model_registry import load_registry
 from service.observability import uvicorn_logging
 from service.settings import Settings, load_settings, require_protection
 
@@ -27,8 +28,16 @@ BAD_INPUT, FAULT = 2, 1
 VersionOption = Annotated[bool, typer.Option("--version", help="Print the version.")]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit status."""
+def main(arguments: Sequence[str] | None = None, open_registry: OpenRegistry = load_registry) -> int:
+    """Run one command.
+
+    Args:
+        arguments: the words after the program's name; those of the process when None.
+        open_registry: finds the models that the settings ask for.
+
+    Returns:
+        The exit status.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     app = build_app()
     missing = load_plugins(app, entry_points(group=COMMAND_GROUP))
@@ -36,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         typer.echo("\n".join(missing), err=True)
         return BAD_INPUT
     try:
-        app(args=words, prog_name=PROGRAM)
+        app(args=words, prog_name=PROGRAM, obj=open_registry)
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else FAULT if stop.code else 0
     except (InputError, NotFound, CohortError) as error:
@@ -80,6 +89,7 @@ def command_names(app: typer.Typer) -> set[str]:
 
 
 def serve(
+    context: typer.Context,
     host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port to listen on.")] = None,
 ) -> None:
@@ -87,7 +97,7 @@ def serve(
     given: dict[str, Any] = {"host": host, "port": port}
     settings = load_settings({name: value for name, value in given.items() if value is not None})
     require_protection(settings)
-    app = create_app(settings)
+    app = create_app(settings, registry=context.obj(settings))
     typer.echo(f"Try it from another terminal:\n\n  {example_request(settings)}\n", err=True)
     uvicorn.run(
         app,

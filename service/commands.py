@@ -20,7 +20,7 @@ from service.adapters.mesh_formats import write_mesh
 from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, manifest_bytes
 from service.app import mask_reader
 from service.console import echo_json, progress, require_free, require_suffix
-from service.model_registry import ModelRegistry, load_registry
+from service.model_registry import ModelRegistry
 from service.ports import MeshFormat, Outcome, SampleFormat
 from service.presentation import model_summary, summary_of
 from service.schemas import EstimateSchema, ModelList, Summary, parse_annotated, parse_labels
@@ -31,12 +31,16 @@ NIFTI_SUFFIX = "nii.gz"
 #: Steps of a reconstruction that a progress bar counts: masks, then the four stages.
 STEPS = 5
 
+#: Finds the models that the settings ask for; the application carries it to its commands.
+OpenRegistry = Callable[[Settings], ModelRegistry]
+
 ModelOption = Annotated[str | None, typer.Option(help="Model name; may be left out when only one is loaded.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
 
 
 def reconstruct(
+    context: typer.Context,
     masks: Annotated[list[Path], typer.Argument(metavar="MASK...", help="Sparse segmentations of one object.")],
     model: ModelOption = None,
     label: Annotated[list[str] | None, typer.Option(help="Label value or values; all non-zero when left out.")] = None,
@@ -60,7 +64,7 @@ def reconstruct(
     if entropy is not None and uncertainty == "none":
         raise InvalidParameter("--entropy needs --uncertainty laplace or ensemble.", part="--entropy")
     settings = load_settings()
-    registry = load_registry(settings)
+    registry = context.obj(settings)
     options = Options(parse_annotated(annotated), uncertainty, mirror, resolution_mm, seed)
     with progress(STEPS) as watch:
         watch("masks")
@@ -74,6 +78,7 @@ def reconstruct(
 
 
 def sample(
+    context: typer.Context,
     output: Annotated[Path, typer.Option(help="Folder, or a file that ends with .zip.")],
     model: ModelOption = None,
     count: Annotated[int, typer.Option(help="How many.")] = 16,
@@ -86,7 +91,7 @@ def sample(
 ) -> None:
     """Draw synthetic shapes from a model."""
     settings = load_settings()
-    chosen = load_registry(settings).get(model)
+    chosen = context.obj(settings).get(model)
     seeds = use_cases.batch_seeds(seed, count, use_cases.MAX_SEED)
     how = Draw(format, temperature, spacing_mm, settings.max_voxels)
     if output.suffix.lower() == ".zip":
@@ -97,9 +102,9 @@ def sample(
     typer.echo(manifest.decode() if as_json else f"{count} shapes of {chosen.manifest.name} written.")
 
 
-def models(as_json: JsonOption = False) -> None:
+def models(context: typer.Context, as_json: JsonOption = False) -> None:
     """List the models."""
-    registry = load_registry(load_settings())
+    registry = context.obj(load_settings())
     loaded = [model_summary(model, f"/v1/models/{model.manifest.name}") for model in use_cases.describe(registry)]
     if as_json:
         echo_json(ModelList(models=loaded))

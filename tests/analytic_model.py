@@ -16,7 +16,7 @@ MEAN_AXES = (12.0, 9.0, 7.0)
 #: Standard deviation of each log semi-axis.
 SPREAD = 0.15
 #: Slope of the logits: nats over one semi-axis.
-STEEPNESS = 12.0
+STEEPNESS = 40.0
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,12 @@ class StandardNormalPrior:
     def to_base(self, latent: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
         """The code itself."""
         return latent
+
+    def base_jacobian(
+        self, latent: Float[np.ndarray, "b d"]
+    ) -> tuple[Float[np.ndarray, "b d"], Float[np.ndarray, "b d d"]]:
+        """The code itself, and the identity."""
+        return latent, np.broadcast_to(np.eye(self.latent_size), (len(latent), self.latent_size, self.latent_size))
 
     def from_base(self, base: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
         """The code itself."""
