@@ -6,7 +6,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from model.errors import InvalidParameter
-from model.inference.isosurface import Refinement, extract_surface, polygonise
+from model.inference.isosurface import extract_surface, polygonise
 from model.inference.mesh import area_cm2, components, is_watertight, largest_component, to_trimesh, volume_ml
 from tests.analytic_shapes import Box, Ellipsoid, Torus, sphere
 
@@ -167,13 +167,6 @@ def test_turned_field_gives_the_turned_surface(seed):
     inertia = to_trimesh(mesh).moment_inertia
     expected = shape.volume_ml * 1000.0 / 5.0 * turn @ np.diag([36.0 + 81.0, 25.0 + 81.0, 25.0 + 36.0]) @ turn.T
     np.testing.assert_allclose(inertia, expected, atol=0.03 * np.abs(expected).max())
-
-
-def test_box_need_not_be_a_multiple_of_the_step():
-    refinement = Refinement(np.array([-5.0, -4.0, -3.3]), np.array([5.2, 4.0, 3.0]), 1.0)
-    while len(points := refinement.query()):
-        refinement.update(sphere(2.5).logits(points))
-    assert refinement.grid().shape == (12, 9, 8)
 
 
 @pytest.mark.parametrize(
