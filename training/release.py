@@ -1,7 +1,10 @@
 """A finished run as a bundle: graphs, statistics of the training codes, and a manifest."""
 
 import hashlib
-from collections.abc import Mapping
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +47,8 @@ def export_run(
     if output.exists() and any(output.iterdir()):
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
     output.mkdir(parents=True, exist_ok=True)
-    files = export_graphs(module.decoder, module.prior, output)
+    with _quiet_exporter():
+        files = export_graphs(module.decoder, module.prior, output)
     write_population(module, record, output / POPULATION)
     sigmas = module.prior.sigma.detach().cpu().numpy().astype(float)
     manifest = Manifest(
@@ -68,6 +72,22 @@ def export_run(
     )
     write_manifest(manifest, output)
     return manifest
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    """Keep the exporter's remarks on its own inner workings from the caller."""
+    talkers = [logging.getLogger(name) for name in ("onnxscript", "onnx_ir")]
+    levels = [talker.level for talker in talkers]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for talker in talkers:
+            talker.setLevel(logging.ERROR)
+        try:
+            yield
+        finally:
+            for talker, level in zip(talkers, levels, strict=True):
+                talker.setLevel(level)
 
 
 def load_module(run: Path, config: TrainingConfig, shapes: int) -> AutoDecoder:

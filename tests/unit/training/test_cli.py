@@ -1,0 +1,205 @@
+import csv
+import json
+
+import nibabel as nib
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from model.bundle import open_bundle
+from training.choices import DeviceName, ObjectiveName, RegimeName, configured, with_duration
+from training.cli import register
+from training.config import TrainingConfig
+
+SMALL = ["--steps", "6", "--latent-size", "3", "--device", "cpu"]
+
+
+def ellipsoid(n):
+    index = np.stack(np.meshgrid(*[np.arange(28)] * 3, indexing="ij"), axis=-1)
+    return (((index - 13.5) / [8.0 + 0.4 * n, 9.0, 10.0 - 0.3 * n]) ** 2).sum(axis=-1) <= 1.0
+
+
+def write(folder, name, mask):
+    folder.mkdir(parents=True, exist_ok=True)
+    nib.save(nib.Nifti1Image(mask.astype(np.uint8), np.eye(4)), folder / f"{name}.nii.gz")
+
+
+@pytest.fixture
+def masks(tmp_path):
+    for n in range(7):
+        write(tmp_path / "masks" / ("test" if n == 6 else "train"), f"e{n}", ellipsoid(n))
+    return tmp_path / "masks"
+
+
+@pytest.fixture(scope="session")
+def run():
+    app = typer.Typer()
+    register(app)
+
+    def call(*words):
+        return CliRunner().invoke(app, [str(word) for word in words])
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory, run):
+    folder = tmp_path_factory.mktemp("bundle")
+    for n in range(6):
+        write(folder / "masks", f"e{n}", ellipsoid(n))
+    words = ("train", "--masks", folder / "masks", "--steps", 150, "--latent-size", 3, "--device", "cpu")
+    assert run(*words, "--output", folder / "run").exit_code == 0
+    result = run("export", folder / "run", "--output", folder / "out", "--name", "egg", "--version", "2.1", "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["name"] == "egg"
+    return folder / "out"
+
+
+class TestTrain:
+    def test_json_says_what_was_trained_on(self, run, masks, tmp_path):
+        result = run("train", "--masks", masks, *SMALL, "--regime", "thin", "--output", tmp_path / "run", "--json")
+        assert result.exit_code == 0, result.stderr
+        summary = json.loads(result.stdout)
+        assert (summary["train"], summary["validation"], summary["steps"]) == (5, 1, 6)
+        assert np.isfinite(summary["figures"]["loss"])
+
+    def test_a_refused_file_stops_the_training_and_is_named_with_its_reason(self, run, masks, tmp_path):
+        index = np.stack(np.meshgrid(*[np.arange(90)] * 3, indexing="ij"), axis=-1)
+        write(masks / "train", "whale", ((index - 44.5) ** 2).sum(axis=-1) <= 40**2)
+        words = ("train", "--masks", masks, *SMALL, "--output", tmp_path / "run")
+        stopped = run(*words)
+        assert stopped.exit_code == 2
+        assert "whale: it does not belong to the cohort: volume" in stopped.stderr
+        assert not (tmp_path / "run").exists()
+        skipped = run(*words, "--skip-refused", "--json")
+        assert skipped.exit_code == 0
+        assert list(json.loads(skipped.stdout)["refused"]) == ["whale"]
+
+    def test_no_bar_and_no_control_sequences_in_a_pipe(self, run, masks, tmp_path):
+        result = run("train", "--masks", masks, *SMALL, "--output", tmp_path / "run")
+        assert result.exit_code == 0
+        assert "\x1b" not in result.output
+        assert "\r" not in result.output
+        assert len(result.stdout.splitlines()) == 1
+
+    def test_a_finished_run_is_resumed_without_a_step(self, run, masks, tmp_path):
+        words = ("train", "--masks", masks, *SMALL, "--output", tmp_path / "run", "--json")
+        assert run(*words).exit_code == 0
+        assert run(*words).exit_code == 2
+        again = run(*words, "--resume")
+        assert again.exit_code == 0
+        assert json.loads(again.stdout)["figures"] == {}
+
+    @pytest.mark.parametrize(
+        ("words", "sentence"),
+        [
+            ((), "--cohort or --masks"),
+            (("--cohort", "talus", "--masks", "."), "--cohort or --masks"),
+            (("--cohort", "talus", "--data", "nowhere"), "data folder does not exist"),
+            (("--masks", "nowhere"), "folder of masks does not exist"),
+            (("--masks", ".", "--shippable"), "--shippable goes with --cohort"),
+        ],
+    )
+    def test_bad_input_ends_with_2_and_one_sentence(self, run, words, sentence):
+        result = run("train", *words)
+        assert result.exit_code == 2
+        assert sentence in result.stderr
+        assert "Traceback" not in result.output
+
+    def test_steps_and_epochs_exclude_each_other(self, run, masks):
+        result = run("train", "--masks", masks, *SMALL, "--epochs", 2)
+        assert result.exit_code == 2
+        assert "epochs" in result.stderr
+
+    def test_an_unknown_choice_is_refused(self, run):
+        assert run("train", "--cohort", "spleen").exit_code == 2
+        assert run("train", "--cohort", "talus", "--regime", "sparse").exit_code == 2
+
+
+class TestConfiguration:
+    def build(self, objective=ObjectiveName.VARIATIONAL, flow=True, ard=True):
+        return configured(objective, RegimeName.THICK, 16, flow=flow, ard=ard, seed=3, device=DeviceName.CPU)
+
+    def test_options_reach_the_configuration(self):
+        config = self.build(flow=False, ard=False)
+        assert (config.regime, config.seed, config.device) == ("thick", 3, "cpu")
+        assert config.decoder.latent_size == config.prior.flow.latent_size == 16
+        assert not config.prior.use_flow
+        assert not config.prior.use_ard
+
+    def test_the_paper_is_selectable_as_written(self):
+        config = self.build(ObjectiveName.PAPER)
+        assert (config.objective.name, config.objective.reconstruction) == ("paper", "dice")
+        assert config.batch_shapes == 6
+        assert not config.prior.standardise
+        assert not config.decoder.unit_columns
+
+    @pytest.mark.parametrize(("shapes", "batch", "steps"), [(12, 6, 30), (13, 6, 45), (4, 6, 15)])
+    def test_an_epoch_sees_every_shape(self, shapes, batch, steps):
+        config = with_duration(TrainingConfig(batch_shapes=batch), None, 15, shapes)
+        assert config.steps == steps
+
+
+@pytest.mark.slow
+class TestExport:
+    def test_the_bundle_opens_and_says_what_it_was_made_of(self, bundle):
+        opened = open_bundle(bundle)
+        manifest = opened.manifest
+        assert (manifest.name, manifest.version, manifest.latent_size) == ("egg", "2.1", 3)
+        assert manifest.training["shapes"] == len(opened.population.codes) == 5
+        assert np.allclose(opened.population.volumes_ml, 4 / 3 * np.pi * 0.72, rtol=0.2)
+        assert np.all(np.array(manifest.half_extent_mm) >= 8.0)
+        density, _ = opened.prior.log_density(opened.population.codes.astype(np.float32))
+        assert np.allclose(density, opened.population.log_densities, rtol=1e-3, atol=1e-3)
+
+    def test_nothing_is_written_over(self, run, bundle):
+        result = run("export", bundle.parent / "run", "--output", bundle)
+        assert result.exit_code == 2
+        assert "not empty" in result.stderr
+
+    def test_a_folder_without_a_run_is_refused(self, run, tmp_path):
+        assert run("export", tmp_path, "--output", tmp_path / "out").exit_code == 2
+
+
+@pytest.mark.slow
+class TestEvaluate:
+    def test_table_json_and_csv_agree(self, run, bundle, masks, tmp_path):
+        words = ("evaluate", "--model", bundle, "--masks", masks, "--regime", "thin", "--regime", "orthogonal")
+        result = run(*words, "--json", "--output", tmp_path / "new" / "cases.csv")
+        assert result.exit_code == 0, result.stderr
+        rows = json.loads(result.stdout)
+        assert [(row["regime"], row["method"]) for row in rows] == [
+            ("thin", "model"),
+            ("thin", "signed distance"),
+            ("thin", "ITK contours"),
+            ("orthogonal", "model"),
+            ("orthogonal", "ITK contours"),
+        ]
+        with (tmp_path / "new" / "cases.csv").open() as stream:
+            lines = list(csv.DictReader(stream))
+        assert [line["case"] for line in lines] == ["e6"] * 5
+        assert [float(line["dice"]) for line in lines] == pytest.approx(
+            [row["figures"]["dice"]["mean"] for row in rows]
+        )
+        text = run(*words)
+        assert text.exit_code == 0
+        assert len(text.stdout.splitlines()) == 6
+
+    def test_validation_cases_can_be_measured_and_limited(self, run, bundle, masks):
+        words = ("evaluate", "--model", bundle, "--masks", masks, "--split", "validation", "--limit", 1)
+        result = run(*words, "--regime", "dense", "--json")
+        assert result.exit_code == 0, result.stderr
+        assert [row["cases"] for row in json.loads(result.stdout)] == [1]
+
+    def test_an_unknown_model_is_refused(self, run, masks):
+        result = run("evaluate", "--model", "spleen", "--masks", masks)
+        assert result.exit_code == 2
+        assert "No such model" in result.stderr
+
+    def test_a_split_without_cases_is_refused(self, run, bundle, tmp_path):
+        for n in range(4):
+            write(tmp_path / "train", f"e{n}", ellipsoid(n))
+        result = run("evaluate", "--model", bundle, "--masks", tmp_path)
+        assert result.exit_code == 2
+        assert "no test cases" in result.stderr
