@@ -111,23 +111,31 @@ class BodyLimitMiddleware:
         if declared.isdecimal() and int(declared) > self._max_bytes:
             await _refuse(self._too_large(), scope, receive, send)
             return
-        await self._app(scope, self._limited(receive), send)
-
-    def _limited(self, receive: Receive) -> Receive:
-        total = 0
-
-        async def counted() -> Message:
-            nonlocal total
-            message = await receive()
-            total += len(message.get("body", b""))
-            if total > self._max_bytes:
-                raise self._too_large()
-            return message
-
-        return counted
+        body = _Body(receive, send, self._max_bytes, self._too_large())
+        await self._app(scope, body.receive, body.send)
 
     def _too_large(self) -> TooLarge:
         return TooLarge(f"The request's body must not be larger than {self._max_bytes} bytes.", part="body")
+
+
+class _Body:
+    def __init__(self, receive: Receive, send: Send, max_bytes: int, error: TooLarge) -> None:
+        self._receive = receive
+        self._send = send
+        self._left = max_bytes
+        self._error = error
+
+    async def receive(self) -> Message:
+        message = await self._receive()
+        self._left -= len(message.get("body", b""))
+        if self._left < 0:
+            raise self._error
+        return message
+
+    async def send(self, message: Message) -> None:
+        if message["type"] == "http.response.start" and self._left < 0:
+            MutableHeaders(scope=message)["Connection"] = "close"  # else the server reads the rest
+        await self._send(message)
 
 
 async def _refuse(error: MorphoFlowError, scope: Scope, receive: Receive, send: Send) -> None:
