@@ -64,7 +64,7 @@ def test_linear_field_is_reproduced_everywhere():
 def test_surface_that_leaves_the_refined_region_is_followed():
     def spike(points):
         """A ball with a needle that no coarse node comes near, in a field that is flat elsewhere."""
-        needle = 1.1 - np.hypot(points[:, 1] - 1.5, points[:, 2] + 0.3)
+        needle = 0.8 - np.hypot(points[:, 1] - 1.5, points[:, 2] + 0.3)
         needle = np.where((points[:, 0] > 0) & (points[:, 0] < 11.6), needle, -1.0)
         return np.clip(np.maximum(sphere(5.0).logits(points), needle), -0.2, 0.2)
 
