@@ -56,7 +56,7 @@ class Grid:
     def centres(self) -> Float[np.ndarray, "n 3"]:
         """World positions of all voxel centres, last index fastest."""
         index = np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), axis=-1)
-        return self.to_world(index.reshape(-1, 3))
+        return self.to_world(index.reshape(-1, 3).astype(float))
 
     def coincides_with(self, other: "Grid") -> bool:
         """Whether both grids have the same voxels to within `COINCIDENCE_TOLERANCE_MM`."""

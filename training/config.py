@@ -62,6 +62,7 @@ class TrainingConfig:
     seed: int = 0
     device: str = "cpu"
     checkpoint_every: int = 500
+    validate_every: int = 1000
 
     def as_dict(self) -> dict[str, Any]:
         """Nested plain values, for JSON."""

@@ -15,6 +15,7 @@ from training.autodecoder import AutoDecoder, Trainer, train
 from training.cohorts.cohort import Case, Cohort
 from training.config import TrainingConfig, config_from_dict
 from training.points import cohort_points, decoder_extent
+from training.validation import Validation
 
 CHECKPOINT = "checkpoint.pt"
 RECORD = "run.json"
@@ -49,7 +50,8 @@ def train_cohort(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RECORD).write_text(json.dumps(record(cohort, config), indent=2) + "\n", encoding="utf-8")
     with SummaryWriter(folder / FIGURES, purge_step=trainer.step) as writer:
-        return train(trainer, folder, _logging_watch(writer, watch))
+        logging = _logging_watch(writer, watch)
+        return train(trainer, folder, _validating_watch(trainer, cohort, writer, logging))
 
 
 def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
@@ -113,6 +115,21 @@ def _check_folder(folder: Path, wanted: dict[str, Any], *, resume: bool) -> None
             "The run in the output folder was made of other masks or settings; the same ones are accepted.",
             part="resume",
         )
+
+
+def _validating_watch(trainer: Trainer, cohort: Cohort, writer: SummaryWriter, watch: Watch) -> Watch:
+    config = trainer.config
+    if not cohort.validation:
+        return watch
+    validation = Validation(config, cohort_points(cohort.validation, "dense", config.seed))
+
+    def validate(step: int, figures: dict[str, float]) -> None:
+        watch(step, figures)
+        if step % config.validate_every == 0 or step == config.steps:
+            for name, value in validation.figures(trainer.module).items():
+                writer.add_scalar(name, value, step)
+
+    return validate
 
 
 def _logging_watch(writer: SummaryWriter, watch: Watch) -> Watch:

@@ -1,0 +1,53 @@
+"""Held-out shapes during training: codes fitted with the networks frozen, and how well they explain the shapes."""
+
+from collections.abc import Sequence
+
+import torch
+
+from training.autodecoder import AutoDecoder
+from training.config import TrainingConfig
+from training.objective import cross_entropy_loss, soft_dice_loss
+from training.samples import PointPool, ShapePoints
+
+#: Adam steps of the fit, its learning rate, and points drawn a shape and step (near, far).
+STEPS, LEARNING_RATE, POINTS = 60, 0.05, (192, 64)
+
+
+class Validation:
+    """Fits codes of held-out shapes from scratch each time, with a random stream of its own: training is the same
+    with and without it."""
+
+    def __init__(self, config: TrainingConfig, shapes: Sequence[ShapePoints]) -> None:
+        self._config = config
+        self._pool = PointPool(shapes, torch.device(config.device))
+
+    def figures(self, module: AutoDecoder) -> dict[str, float]:
+        """Cross-entropy (nats a band voxel), soft Dice, and negative log prior density (nats) over held-out shapes."""
+        generator = torch.Generator(device=self._pool.device).manual_seed(self._config.seed)
+        chosen = torch.arange(self._pool.size, device=self._pool.device)
+        size = self._config.decoder.latent_size
+        codes = torch.zeros(self._pool.size, size, device=self._pool.device, requires_grad=True)
+        optimiser = torch.optim.Adam([codes], LEARNING_RATE)
+        weight = self._config.objective.lambda_flow
+        for _ in range(STEPS):
+            batch = self._pool.draw(chosen, POINTS, generator)
+            fit = cross_entropy_loss(module.decoder(codes, batch.points), batch.labels, batch.weights)
+            loss = (fit - weight * module.prior.log_density(codes)).sum()
+            (codes.grad,) = torch.autograd.grad(loss, codes)
+            optimiser.step()
+        return self._measure(module, codes.detach(), chosen, generator)
+
+    def _measure(
+        self, module: AutoDecoder, codes: torch.Tensor, chosen: torch.Tensor, generator: torch.Generator
+    ) -> dict[str, float]:
+        batch = self._pool.draw(chosen, (8 * POINTS[0], 8 * POINTS[1]), generator)
+        with torch.no_grad():
+            logits = module.decoder(codes, batch.points)
+            fit = cross_entropy_loss(logits, batch.labels, batch.weights).mean()
+            dice = 1.0 - soft_dice_loss(logits, batch.labels, batch.weights).mean()
+            density = -module.prior.log_density(codes).mean()
+        return {
+            "validation/cross_entropy": fit.item(),
+            "validation/dice": dice.item(),
+            "validation/negative_log_density": density.item(),
+        }
