@@ -18,7 +18,8 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 LIGHT = np.array([-0.4, -0.6, 0.7]) / np.linalg.norm([-0.4, -0.6, 0.7])
 AMBIENT = 0.45
-VIEW = {"elev": 22.0, "azim": -62.0}
+VIEW = {"elev": 28.0, "azim": -35.0}
+ZOOM = 1.2
 
 
 def draw(mask: Path, mesh: Path, surface_sd: Sequence[float], entropy: Path, target: Path) -> None:
@@ -56,7 +57,7 @@ def annotated_points(mask: Path) -> Float[np.ndarray, "n 3"]:
 
 def draw_slices(axes: Axes3D, points: Float[np.ndarray, "n 3"]) -> None:
     """What was drawn."""
-    axes.scatter(points[:, 0], points[:, 1], points[:, 2], s=5, c="#1f5f8b", linewidths=0)
+    axes.scatter(points[:, 0], points[:, 1], points[:, 2], s=9, c="#1f5f8b", marker="s", linewidths=0, depthshade=False)
     axes.set_title("three annotated slices")
 
 
@@ -91,6 +92,7 @@ def frame(axes: Axes3D, vertices: Float[np.ndarray, "v 3"]) -> None:
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_zlim(low[2], high[2])
-    axes.set_box_aspect(tuple(high - low))
+    axes.set_box_aspect(tuple(high - low), zoom=ZOOM)
+    axes.locator_params(nbins=4)
     axes.view_init(**VIEW)
     axes.set(xlabel="R (mm)", ylabel="A (mm)", zlabel="S (mm)")

@@ -174,6 +174,18 @@ class TestInstalledService:
         for bundle in shipped_bundles:
             assert json.loads((bundle / "manifest.json").read_text())["name"] in listed.stdout
 
+    @pytest.mark.parametrize("format", ["ply", "stl", "obj", "glb", "3mf", "vtp", "mz3"])
+    @pytest.mark.usefixtures("shipped_bundles")
+    def test_a_mesh_is_made_without_torch(
+        self, format: str, installation: Path, tmp_path: Path, repository: Path
+    ) -> None:
+        example = repository / "docs" / "examples" / "hippocampus_three_slices.nii.gz"
+        target = tmp_path / f"mesh.{format}"
+        command = (installation / "morphoflow", "reconstruct", example, "--output", target, "--uncertainty", "none")
+        made = self.command(installation, tmp_path, *command)
+        assert made.returncode == 0, made.stderr
+        assert target.stat().st_size > 0
+
     def test_environment_agrees_with_itself(self, installation: Path, tmp_path: Path) -> None:
         checked = self.command(installation, tmp_path, installation / "pip", "check")
         assert checked.returncode == 0, checked.stdout
