@@ -1,0 +1,88 @@
+"""The real service in a process of its own, and how much memory it took."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+
+START_LIMIT_S = 120.0
+STOP_LIMIT_S = 30.0
+REQUEST_LIMIT_S = 120.0
+_SERVE = "import sys; from service.cli import main; sys.exit(main(sys.argv[1:]))"
+
+
+@dataclass(frozen=True)
+class Server:
+    """A running service: its client and its process."""
+
+    client: httpx.Client
+    process: subprocess.Popen[bytes]
+
+    def peak_memory_mib(self) -> float:
+        """Largest resident memory of the process and its children so far, summed over them (MiB; Linux only)."""
+        return sum(_peak_kib(pid) for pid in _family(self.process.pid)) / 1024.0
+
+
+@contextmanager
+def serving(models: tuple[Path, ...]) -> Iterator[Server]:
+    """The service with the shipped models and further bundles, on a free local port; gone afterwards."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    with tempfile.TemporaryDirectory() as results:
+        environment = {
+            **os.environ,
+            "MORPHOFLOW_RESULTS_FOLDER": str(Path(results) / "results"),
+            "MORPHOFLOW_LOG_LEVEL": "warning",
+            "MORPHOFLOW_MODELS": os.pathsep.join(str(model.resolve()) for model in models),
+        }
+        command = [sys.executable, "-c", _SERVE, "serve", "--host", "127.0.0.1", "--port", str(port)]
+        log = Path(results) / "service.log"
+        with log.open("wb") as stream:
+            process = subprocess.Popen(command, env=environment, stderr=stream)
+        try:
+            with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=REQUEST_LIMIT_S) as client:
+                _wait_until_ready(client, process, log)
+                yield Server(client, process)
+        finally:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(timeout=STOP_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _wait_until_ready(client: httpx.Client, process: subprocess.Popen[bytes], log: Path) -> None:
+    limit = time.monotonic() + START_LIMIT_S
+    while time.monotonic() < limit and process.poll() is None:
+        try:
+            if client.get("/readyz").is_success:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.1)
+    said = log.read_text(errors="replace").strip().splitlines()[-1:]
+    raise SystemExit(f"The service did not become ready: {''.join(said)}")
+
+
+def _family(pid: int) -> list[int]:
+    found = [pid]
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in task.read_text().split():
+            found += _family(int(child))
+    return found
+
+
+def _peak_kib(pid: int) -> int:
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next((int(line.split()[1]) for line in lines if line.startswith("VmHWM:")), 0)
