@@ -43,7 +43,7 @@ lint: $(VENV)/.development  ## formatting, lint, types and import contracts
 	$(BIN)/lint-imports
 
 test: lint  ## everything a change has to pass
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(or $(JOBS),2) --dist loadgroup $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(or $(JOBS),2) --dist loadscope $(ARGS)
 
 demo: $(VENV)/.demo  ## request, mesh, uncertainty map and a picture in one go, into build/demo
 	$(BIN)/python docs/examples/demo.py build/demo
