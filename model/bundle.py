@@ -17,6 +17,14 @@ BackendName = Literal["onnx", "torchscript"]
 FORMAT = 1
 MANIFEST = "manifest.json"
 POPULATION = "population.npz"
+#: Files without which there is nothing to run.
+REQUIRED_FILES = (
+    POPULATION,
+    "decoder_logits.onnx",
+    "decoder_jacobians.onnx",
+    "prior_density.onnx",
+    "prior_base_jacobian.onnx",
+)
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,7 @@ class Manifest:
         active_dimensions: how many sigmas explain 95, 97 and 99 % of the base variance.
         half_extent_mm: half size of the canonical box that holds every training shape.
         resolution_mm: default grid step of the surface.
+        calibration: how the likelihood precision was chosen; empty when it was not.
         likelihood_precision: information of one mm^2 of annotated plane, 1/mm^2; calibrated on validation shapes.
         training: cohort, cases, regime, command and so on.
         licence, attribution: of the weights.
@@ -52,6 +61,7 @@ class Manifest:
     half_extent_mm: tuple[float, float, float]
     resolution_mm: float
     likelihood_precision: float
+    calibration: dict[str, object]
     training: dict[str, object]
     licence: str
     attribution: str
@@ -126,8 +136,9 @@ def _manifest_of(values: dict[str, Any]) -> Manifest:
     if missing:
         raise BundleCorrupt(f"{MANIFEST} lacks {', '.join(missing)}; one written by morphoflow export is accepted.")
     values = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items() if name in known}
-    if POPULATION not in values["files"]:
-        raise BundleCorrupt(f"{MANIFEST} lists no {POPULATION}; one written by morphoflow export is accepted.")
+    unlisted = [name for name in REQUIRED_FILES if name not in values["files"]]
+    if unlisted:
+        raise BundleIncomplete(f"{MANIFEST} lists no {', '.join(unlisted)}; export the model anew.")
     return Manifest(**values)
 
 

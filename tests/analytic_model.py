@@ -97,6 +97,7 @@ def _manifest(name: str, mean_axes: tuple[float, float, float]) -> Manifest:
         half_extent_mm=(first, second, third),
         resolution_mm=1.0,
         likelihood_precision=1.0,
+        calibration={},
         training={"cohort": "analytic"},
         licence="CC0-1.0",
         attribution="none",

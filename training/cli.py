@@ -1,4 +1,4 @@
-"""The commands train, export and evaluate; torch is imported when a command needs it.
+"""The commands train, export, calibrate and evaluate; torch is imported when a command needs it.
 
 Results go to standard output, what was refused or peculiar to standard error. Exit status: 0, 2 for input that
 cannot be used (masks, models, values), 1 for a fault.
@@ -39,6 +39,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands to an application."""
     app.command("train")(train)
     app.command("export")(export)
+    app.command("calibrate")(calibrate)
     app.command("evaluate")(evaluate)
 
 
@@ -90,6 +91,33 @@ def export(
         typer.echo(json.dumps(summary) if as_json else f"{manifest.name} {manifest.version} written to {output}")
 
 
+def calibrate(
+    bundle: Annotated[Path, typer.Argument(help="Folder of an exported bundle; its manifest is rewritten.")],
+    cohort: CohortOption = None,
+    masks: MasksOption = None,
+    label: LabelOption = None,
+    data: DataOption = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of validation persons; the one used in training.")] = 0,
+    skip_refused: SkipOption = False,
+    shippable: ShippableOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Choose on validation shapes how much a drawn mm^2 is worth, and record it in the bundle."""
+    with exit_status():
+        from training.calibration import CANDIDATES, calibrate_bundle
+
+        options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
+        found = open_cohort(cohort, masks, data, options, labels=tuple(label or ()))
+        if not found.validation:
+            raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
+        with progress(len(CANDIDATES), f"calibrating on {found.name}") as bar:
+            chosen = calibrate_bundle(bundle, found, lambda precision: bar.advance(bar.task_ids[0]))
+        scores = ", ".join(f"{precision:g}: {value:.4f}" for precision, value in chosen.scores.items())
+        summary = {"likelihood_precision": chosen.precision, "scores": chosen.scores}
+        words = f"likelihood precision {chosen.precision:g} per mm^2 (cross-entropy by candidate: {scores})"
+        typer.echo(json.dumps(summary) if as_json else words)
+
+
 def evaluate(
     model: Annotated[str, typer.Option(help="Name of a shipped model, or the folder of a bundle.")],
     cohort: CohortOption = None,
@@ -102,15 +130,16 @@ def evaluate(
     limit: Annotated[int | None, typer.Option(min=1, help="Measure only so many cases.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of validation persons and reconstructions.")] = 0,
     output: Annotated[Path | None, typer.Option(help="CSV file with every case.")] = None,
+    record: Annotated[bool, typer.Option("--record", help="Write the figures into the bundle's manifest.")] = False,
     skip_refused: SkipOption = False,
     shippable: ShippableOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure a model on held-out masks, beside interpolation without a model."""
     with exit_status():
-        from training.evaluate import open_named
+        from training.evaluate import find_bundle, open_named, shipped_bundles
         from training.report import as_json as json_of
-        from training.report import as_text, summarise, write_csv
+        from training.report import as_text, record_accuracy, summarise, write_csv
 
         options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
         opened = open_named(model)
@@ -125,6 +154,8 @@ def evaluate(
             with output.open("w", newline="", encoding="utf-8") as stream:
                 write_csv(measured, stream)
         rows = summarise(measured)
+        if record:
+            record_accuracy(find_bundle(model, [shipped_bundles()]), rows, split.value)
         typer.echo(json_of(rows) if as_json else as_text(rows))
 
 

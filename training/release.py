@@ -64,6 +64,7 @@ def export_run(
         half_extent_mm=(record["half_extent_mm"][0], record["half_extent_mm"][1], record["half_extent_mm"][2]),
         resolution_mm=RESOLUTION_MM,
         likelihood_precision=likelihood_precision,
+        calibration={},
         training=training_facts(config, record),
         licence=record["licence"],
         attribution=record["attribution"],

@@ -4,11 +4,13 @@ import csv
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from io import TextIOBase
+from pathlib import Path
 
 import numpy as np
 
+from model.bundle import read_manifest, write_manifest
 from training.evaluate import Measurement, Method
 from training.sparsify import Regime
 
@@ -48,6 +50,21 @@ def summarise(measurements: Sequence[Measurement]) -> list[Row]:
     """One row for each regime and method, in the order of their first appearance."""
     keys = dict.fromkeys((found.regime, found.method) for found in measurements)
     return [_row(measurements, regime, method) for regime, method in keys]
+
+
+def record_accuracy(bundle: Path, rows: Sequence[Row], split: str) -> None:
+    """Write the model's mean figures into its bundle's manifest, by regime.
+
+    Raises:
+        BundleError: the manifest cannot be read.
+    """
+    manifest, _ = read_manifest(bundle)
+    measured = {
+        f"{split}/{row.regime}": {"cases": float(row.cases)} | {name: row.figures[name].mean for name in FIGURES}
+        for row in rows
+        if row.method == Method.MODEL
+    }
+    write_manifest(replace(manifest, accuracy={**manifest.accuracy, **measured}), bundle)
 
 
 def as_text(rows: Sequence[Row]) -> str:

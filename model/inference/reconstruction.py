@@ -30,7 +30,7 @@ OBSERVATION_BUDGET = 2500
 RESOLUTION_RANGE_MM = (0.25, 10.0)
 #: Below this percentile of the training population a shape is called unlike it.
 ATYPICAL_PERCENTILE = 1.0
-#: Above this disagreement of a plane (1 - Dice) the answer names it.
+#: The answer names a plane whose section is wrong by more than this share of itself and of the mean drawn section.
 DISAGREEMENT_LIMIT = 0.25
 
 
@@ -119,19 +119,19 @@ def reconstruct(
     factors = displacement_factors(model, state, mesh)
     if factors is not None:
         mesh = replace(mesh, scalars={"surface_sd_mm": np.linalg.norm(factors, axis=1)})
-    residuals = plane_residuals(model, found, observations)
+    sections = _sections(model, found, observations)
     density, percentile = typicality(model, found)
     return Reconstruction(
         state=state,
         mesh=mesh,
         planes=observations.planes,
         observation_count=len(observations.points),
-        residuals=residuals,
+        residuals=tuple(PlaneResidual(s.plane, s.disagreement, s.mean_error) for s in sections),
         volume_ml=volume_estimate(mesh, factors),
         area_cm2=area_estimate(mesh, factors),
         log_prior_density=density,
         typicality_percentile=percentile,
-        warnings=_warnings(found, percentile, residuals),
+        warnings=_warnings(found, percentile, disagreeing_planes(sections)),
     )
 
 
@@ -150,25 +150,51 @@ def _state(model: ShapeModel, observations: Observations, found: Fit, options: O
     return ShapeState((found,), laplace_covariance(found) if options.uncertainty == "laplace" else None)
 
 
-def plane_residuals(model: ShapeModel, found: Fit, observations: Observations) -> tuple[PlaneResidual, ...]:
-    """Disagreement of each drawn plane with the reconstruction's section through it."""
+@dataclass(frozen=True)
+class _Section:
+    """Observations of one plane beside the reconstruction there: mm^2 drawn, reconstructed and shared."""
+
+    plane: Plane
+    drawn: float
+    reconstructed: float
+    shared: float
+    mean_error: float
+
+    @property
+    def disagreement(self) -> float:
+        """``1 - Dice``."""
+        total = self.drawn + self.reconstructed
+        return 1.0 - 2.0 * self.shared / total if total > 0 else 0.0
+
+    @property
+    def wrong(self) -> float:
+        """Area that belongs to only one of the two (mm^2)."""
+        return self.drawn + self.reconstructed - 2.0 * self.shared
+
+
+def _sections(model: ShapeModel, found: Fit, observations: Observations) -> list[_Section]:
     logits = fitted_logits(model, found, observations.points)
-    probability = 1.0 / (1.0 + np.exp(-logits.astype(float)))
-    return tuple(
-        _residual(plane, probability[here], observations.labels[here], observations.weights[here])
-        for number, plane in enumerate(observations.planes)
-        for here in [observations.plane_of == number]
-    )
+    error = observations.labels - 1.0 / (1.0 + np.exp(-logits.astype(float)))
+    drawn, inside = observations.labels * observations.weights, (logits > 0) * observations.weights
+    sections = []
+    for number, plane in enumerate(observations.planes):
+        here = observations.plane_of == number
+        if here.any():
+            shared = float(inside[here] @ observations.labels[here])
+            sections.append(
+                _Section(plane, float(drawn[here].sum()), float(inside[here].sum()), shared, float(error[here].mean()))
+            )
+    return sections
 
 
-def _residual(
-    plane: Plane, probability: Float[np.ndarray, "n"], labels: Float[np.ndarray, "n"], weights: Float[np.ndarray, "n"]
-) -> PlaneResidual:
-    inside = probability > 0.5
-    total = float(weights @ (labels + inside))
-    overlap = 2.0 * float(weights @ (labels * inside)) / total if total > 0 else 1.0
-    mean_error = float(weights @ (labels - probability) / max(weights.sum(), 1e-9))
-    return PlaneResidual(plane, 1.0 - overlap, mean_error)
+def disagreeing_planes(sections: Sequence[_Section]) -> list[Plane]:
+    """Planes on which much of the section, and much compared with the other planes' sections, is wrong."""
+    typical = float(np.mean([section.drawn for section in sections]))
+    return [
+        section.plane
+        for section in sections
+        if section.disagreement > DISAGREEMENT_LIMIT and section.wrong > DISAGREEMENT_LIMIT * typical
+    ]
 
 
 def typicality(model: ShapeModel, found: Fit) -> tuple[float, float]:
@@ -177,11 +203,10 @@ def typicality(model: ShapeModel, found: Fit) -> tuple[float, float]:
     return density, float(100.0 * np.mean(model.population.log_densities < density))
 
 
-def _warnings(found: Fit, percentile: float, residuals: Sequence[PlaneResidual]) -> tuple[str, ...]:
+def _warnings(found: Fit, percentile: float, apart: Sequence[Plane]) -> tuple[str, ...]:
     sentences = [] if found.status == "converged" else [found.message]
     if percentile < ATYPICAL_PERCENTILE:
         sentences.append("The shape is unlike the population that the model was trained on; do not rely on it.")
-    apart = [r.plane for r in residuals if r.disagreement > DISAGREEMENT_LIMIT]
     if apart:
         names = ", ".join(f"mask[{p.stack}] axis {p.axis} index {p.index}" for p in apart)
         sentences.append(f"The reconstruction disagrees with the drawing on {names}; do not rely on it there.")
