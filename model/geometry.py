@@ -38,20 +38,21 @@ class Grid:
     @property
     def spacing(self) -> Float[np.ndarray, "3"]:
         """Voxel size along each index axis (mm)."""
-        return np.linalg.norm(self.affine[:3, :3], axis=0)
+        return np.asarray(np.linalg.norm(self.affine[:3, :3], axis=0))
 
     @property
     def directions(self) -> Float[np.ndarray, "3 3"]:
         """Unit world directions of the index axes, one a column."""
-        return self.affine[:3, :3] / self.spacing
+        return np.asarray(self.affine[:3, :3] / self.spacing)
 
     def to_world(self, index: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Voxel indices (may be fractional) to world mm."""
-        return np.asarray(index, float) @ self.affine[:3, :3].T + self.affine[:3, 3]
+        return np.asarray(np.asarray(index, float) @ self.affine[:3, :3].T + self.affine[:3, 3])
 
     def to_index(self, world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """World mm to fractional voxel indices; inverse of `to_world`."""
-        return (np.asarray(world, float) - self.affine[:3, 3]) @ np.linalg.inv(self.affine[:3, :3]).T
+        offset = np.asarray(world, float) - self.affine[:3, 3]
+        return np.asarray(offset @ np.linalg.inv(self.affine[:3, :3]).T)
 
     def centres(self) -> Float[np.ndarray, "n 3"]:
         """World positions of all voxel centres, last index fastest."""
@@ -62,7 +63,8 @@ class Grid:
         """Whether both grids have the same voxels to within `COINCIDENCE_TOLERANCE_MM`."""
         if self.shape != other.shape:
             return False
-        corners = np.array([[0, 0, 0], np.array(self.shape) - 1.0, [self.shape[0] - 1.0, 0, 0], [0, self.shape[1] - 1.0, 0]])
+        last = np.array(self.shape) - 1.0
+        corners = np.array([[0, 0, 0], last, [last[0], 0, 0], [0, last[1], 0]])
         gap = np.abs(self.to_world(corners) - other.to_world(corners)).max()
         return bool(gap <= COINCIDENCE_TOLERANCE_MM)
 
@@ -87,19 +89,19 @@ class Pose:
     def linear(self) -> Float[np.ndarray, "3 3"]:
         """``exp(s) R F``."""
         flip = np.diag([-1.0 if self.mirrored else 1.0, 1.0, 1.0])
-        return np.exp(self.log_scale) * self.rotation @ flip
+        return np.asarray(np.exp(self.log_scale) * self.rotation @ flip)
 
     def to_canonical(self, world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """World mm to canonical mm."""
-        return (world - self.position) @ self.linear.T
+        return np.asarray((world - self.position) @ self.linear.T)
 
     def to_world(self, canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Canonical mm to world mm; inverse of `to_canonical`."""
-        return canonical @ np.linalg.inv(self.linear).T + self.position
+        return np.asarray(canonical @ np.linalg.inv(self.linear).T + self.position)
 
     def gradient_to_world(self, gradient: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Gradient with respect to canonical points to gradient with respect to world points."""
-        return gradient @ self.linear
+        return np.asarray(gradient @ self.linear)
 
     def moved(self, step: Float[np.ndarray, "7"]) -> "Pose":
         """The pose after a step (position mm, rotation vector rad applied on the left, log scale)."""

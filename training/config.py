@@ -17,8 +17,9 @@ class ObjectiveConfig:
     """Weights of the joint objective.
 
     Attributes:
-        name: ``paper`` treats codes as points and adds the negative log prior density; ``variational`` treats each code
-            as a diagonal Gaussian and adds the Kullback-Leibler divergence to the prior, which keeps the density bounded.
+        name: ``paper`` treats codes as points and adds the negative log prior density; ``variational`` treats each
+            code as a diagonal Gaussian and adds the Kullback-Leibler divergence to the prior, which keeps the
+            density bounded.
         reconstruction: loss over sampled points and labels.
         lambda_flow: weight of the density or divergence term against the mean loss over points.
         lambda_ard: weight of the Gamma prior on the precisions.

@@ -14,8 +14,10 @@ STEPS, LEARNING_RATE, POINTS = 60, 0.05, (192, 64)
 
 
 class Validation:
-    """Fits codes of held-out shapes from scratch each time, with a random stream of its own: training is the same
-    with and without it."""
+    """Fits codes of held-out shapes from scratch each time.
+
+    Its random stream is its own: training is the same with and without it.
+    """
 
     def __init__(self, config: TrainingConfig, shapes: Sequence[ShapePoints]) -> None:
         self._config = config

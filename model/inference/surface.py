@@ -24,7 +24,7 @@ def surface_of(model: ShapeModel, latent: Float[np.ndarray, "d"], pose: Pose, st
     step = (step_mm or model.manifest.resolution_mm) * float(np.exp(pose.log_scale))
 
     def field(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        return model.decoder.logits(latent[None], points[None])[0]
+        return np.asarray(model.decoder.logits(latent[None], points[None])[0])
 
     def gradient(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
         logits, _, by_point = model.decoder.logits_and_jacobians(latent[None], points[None])
@@ -50,5 +50,3 @@ def covering_grid(mesh: Mesh, spacing_mm: float, margin_mm: float = 5.0) -> Grid
     affine = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
     affine[:3, 3] = lower
     return Grid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
-
-

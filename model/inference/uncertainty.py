@@ -97,7 +97,8 @@ def occupancy(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndar
 
 def _probabilities(model: ShapeModel, state: ShapeState, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
     if state.members:
-        return np.mean([_sigmoid(fitted_logits(model, member, points)) for member in state.members], axis=0)
+        members = [_sigmoid(fitted_logits(model, member, points)) for member in state.members]
+        return np.asarray(np.mean(members, axis=0))
     logits = fitted_logits(model, state.fits[0], points)
     result = _sigmoid(logits)
     open_points = np.abs(logits) < SATURATED_LOGIT

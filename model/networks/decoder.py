@@ -6,7 +6,9 @@ Newton steps and surface normals are exact, and each latent dimension's weights 
 norm, so that the scale of a latent dimension is the scale of its effect and ARD has something to select.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -40,9 +42,9 @@ class OccupancyDecoder(nn.Module):
         super().__init__()
         self.shape = shape
         self.second_entry = shape.depth // 2
-        self.from_point = nn.ModuleList([nn.Linear(3, shape.width) for _ in range(2)])
+        self.from_point = _linears([nn.Linear(3, shape.width) for _ in range(2)])
         self.from_latent = nn.Parameter(torch.randn(2 * shape.width, shape.latent_size) / shape.width**0.5)
-        self.hidden = nn.ModuleList([nn.Linear(shape.width, shape.width) for _ in range(shape.depth - 1)])
+        self.hidden = _linears([nn.Linear(shape.width, shape.width) for _ in range(shape.depth - 1)])
         self.out = nn.Linear(shape.width, 1)
         self._initialise()
 
@@ -66,7 +68,8 @@ class OccupancyDecoder(nn.Module):
         self, which: int, latent: Float[Tensor, "b d"], scaled: Float[Tensor, "b n 3"]
     ) -> Float[Tensor, "b n width"]:
         bias = functional.linear(latent, self.latent_weights()[which])
-        return self.from_point[which](scaled) + bias[:, None, :]
+        entry: Tensor = self.from_point[which](scaled) + bias[:, None, :]
+        return entry
 
     def _pre_activations(
         self, latent: Float[Tensor, "b d"], points: Float[Tensor, "b n 3"]
@@ -88,7 +91,8 @@ class OccupancyDecoder(nn.Module):
             points: canonical frame, mm.
         """
         last = self._pre_activations(latent, points)[-1]
-        return self.out(functional.silu(last)).squeeze(-1)
+        logits: Tensor = self.out(functional.silu(last)).squeeze(-1)
+        return logits
 
     def jacobians(
         self, latent: Float[Tensor, "b d"], points: Float[Tensor, "b n 3"]
@@ -107,6 +111,11 @@ class OccupancyDecoder(nn.Module):
         by_latent = entries[0] @ first + entries[1] @ second
         by_point = entries[0] @ self.from_point[0].weight + entries[1] @ self.from_point[1].weight
         return logits, by_latent, by_point / self.shape.extent_mm
+
+
+def _linears(layers: list[nn.Linear]) -> Sequence[nn.Linear]:
+    """Layers registered with their module, typed as what they are."""
+    return cast("Sequence[nn.Linear]", nn.ModuleList(layers))
 
 
 def silu_slope(value: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:

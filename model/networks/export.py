@@ -10,7 +10,6 @@ Graphs (batch ``b`` and points ``n`` dynamic, float32):
   the autoregressive inverse as a fixed point, exact after at most D steps
 """
 
-import io
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -148,9 +147,7 @@ def graph_specs(decoder: OccupancyDecoder, prior: LatentPrior) -> list[GraphSpec
     return [
         GraphSpec("decoder_logits", logits, where, ("logits",), logits),
         GraphSpec("decoder_jacobians", jacobians, where, derivatives, jacobians),
-        GraphSpec(
-            "prior_density", density, ("latent",), ("log_density", "gradient", "base"), ScriptedDensity(prior)
-        ),
+        GraphSpec("prior_density", density, ("latent",), ("log_density", "gradient", "base"), ScriptedDensity(prior)),
         GraphSpec("prior_base_jacobian", BaseJacobianGraph(prior), ("latent",), ("base", "jacobian"), None),
         *(GraphSpec(f"prior_sampling_{k}", s, ("target", "guess"), ("next",), s) for k, s in enumerate(steps)),
     ]
@@ -193,9 +190,7 @@ def _onnx_bytes(spec: GraphSpec, flat: nn.Module, size: int, extent: float) -> b
     )
     if exported is None:
         raise ParityError(f"{spec.name} could not be written as an ONNX graph.")
-    buffer = io.BytesIO()
-    exported.save(buffer)
-    return buffer.getvalue()
+    return bytes(exported.model_proto.SerializeToString())
 
 
 def _scripted(module: nn.Module, spec: GraphSpec, size: int, extent: float) -> torch.jit.ScriptModule:

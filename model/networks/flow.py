@@ -4,7 +4,9 @@ Each transform's splines for dimension i are read off a masked MLP (MADE, Germai
 before i; the order alternates between transforms. The Jacobian is triangular in the transform's own order.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -95,7 +97,8 @@ class SplineFlow(nn.Module):
     def __init__(self, shape: FlowShape) -> None:
         super().__init__()
         self.shape = shape
-        self.transforms = nn.ModuleList([SplineTransform(shape, reverse=i % 2 == 1) for i in range(shape.transforms)])
+        transforms = [SplineTransform(shape, reverse=i % 2 == 1) for i in range(shape.transforms)]
+        self.transforms = cast("Sequence[SplineTransform]", nn.ModuleList(transforms))
 
     def forward(self, x: Float[Tensor, "b d"]) -> tuple[Float[Tensor, "b d"], Float[Tensor, "b"]]:
         """``g(x)`` and ``log |det dg/dx|``."""
