@@ -60,7 +60,7 @@ wheel: $(VENV)/.development  ## build/dist/*.whl
 
 lock:  ## renew constraints.txt from an environment of its own
 	rm -rf build/lock && $(PYTHON) -m venv build/lock
-	build/lock/bin/pip install --quiet 'torch==$(TORCH)' '.[training,demo,pacs,test,dev]' 'hatchling>=1.27,<2' 'editables>=0.5'
+	build/lock/bin/pip install --quiet 'torch==$(TORCH)' '.[training,demo,pacs,test,dev]'
 	head -n 2 constraints.txt > build/constraints.txt
 	build/lock/bin/pip freeze --exclude morphoflow | sed 's/+cpu$$//' >> build/constraints.txt
 	mv build/constraints.txt constraints.txt
