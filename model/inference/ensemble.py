@@ -17,14 +17,14 @@ def fit_ensemble(
 ) -> tuple[Fit, ...]:
     """Refits under random weights of the planes (Bayesian bootstrap, Rubin 1981), each from a random start.
 
-    The starting pose is the fit's; the starting code is drawn around the fit's by half a prior SD.
+    The starting pose is the fit's; the starting code is drawn around the fit's by half a prior SD of the flow's base.
     """
     random = np.random.default_rng(seed)
     sigmas = np.asarray(model.manifest.sigmas)
+    base = model.prior.to_base(found.latent[None]) + 0.5 * sigmas * random.standard_normal((members, len(sigmas)))
     fits = []
-    for _ in range(members):
+    for latent in model.prior.from_base(base):
         shares = random.dirichlet(np.ones(len(observations.planes))) * len(observations.planes)
         weighted = replace(observations, weights=observations.weights * shares[observations.plane_of])
-        latent = found.latent + 0.5 * sigmas * random.standard_normal(len(sigmas))
         fits.append(fit_from(model, weighted, found.pose, FitOptions(), latent=latent))
     return tuple(fits)

@@ -4,12 +4,12 @@ The objective is the negative log posterior
 
     E(z, pose) = lambda * sum_n w_n BCE(logit_n, y_n) + 1/2 |z0(z) / sigma|^2 - log p(pose)
 
-over observations with weights ``w_n`` (mm^2 of annotated plane) and likelihood precision ``lambda`` (1/mm^2; neighbouring
-voxels are not independent, so it is calibrated on validation shapes). Each evaluation gives logits with their Jacobians
-by latent code and point; the pose's follow by the chain rule. The prior's mode is taken in the flow's base coordinates
-``z0 = g(z)``, where it is Gaussian: that makes it a sum of squares with Jacobian ``dz0/dz``, and the whole a Gauss-Newton
-problem with curvature ``lambda w p (1 - p) J J^T`` plus ``(dz0/dz)^T diag(1/sigma^2) dz0/dz`` (Levenberg 1944,
-Marquardt 1963). The density's own mode in ``z`` would follow every ripple of the splines' determinant.
+over observations with weights ``w_n`` (mm^2 of annotated plane) and likelihood precision ``lambda`` (1/mm^2;
+neighbouring voxels are not independent, so it is calibrated on validation shapes). Each evaluation gives logits with
+their Jacobians by latent code and point; the pose's follow by the chain rule. The prior's mode is taken in the flow's
+base coordinates ``z0 = g(z)``, where it is Gaussian: that makes it a sum of squares with Jacobian ``dz0/dz``, and the
+whole a Gauss-Newton problem with curvature ``lambda w p (1 - p) J J^T`` plus ``(dz0/dz)^T diag(1/sigma^2) dz0/dz``
+(Levenberg 1944, Marquardt 1963). The density's own mode in ``z`` would follow every ripple of the splines' determinant.
 """
 
 from collections.abc import Sequence
@@ -21,12 +21,16 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from model.bundle import ShapeModel
 from model.geometry import POSE_SIZE, Pose
 from model.inference.observations import Observations
 
 MirrorRule = Literal["auto", "never", "always"]
+
+#: Up to this damping a step is close to the Gauss-Newton step.
+FREE_DAMPING = 1.0
 
 
 class FitStatus(StrEnum):
@@ -118,7 +122,7 @@ class _Objective:
         )
         jacobian = sharpness * np.concatenate([by_latent, pose.jacobian(canonical, by_point)], axis=1)
         scaled = sharpness * logits.astype(float)
-        probability = 1.0 / (1.0 + np.exp(-scaled))
+        probability = expit(scaled)
         cross_entropy = np.logaddexp(0.0, scaled) - self._labels * scaled
         fisher = self._weights * probability * (1.0 - probability)
         point = _Point(
@@ -186,7 +190,8 @@ def _descend(
         step = _damped_step(point, damping)
         expected = -0.5 * float(step @ point.gradient)
         if expected < options.tolerance:
-            return point, iteration, FitStatus.CONVERGED
+            # Behind rejected steps a step is short by its damping, not because the optimum is near.
+            return point, iteration, FitStatus.CONVERGED if damping <= FREE_DAMPING else FitStatus.STALLED
         trial = objective.at(point.latent + step[:-POSE_SIZE], point.pose.moved(step[-POSE_SIZE:]), sharpness)
         gain = (point.value - trial.value) / expected
         if gain > 0:

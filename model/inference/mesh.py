@@ -66,7 +66,7 @@ def vertex_areas(mesh: Mesh) -> Float[np.ndarray, "v"]:
 
 
 def area_gradient(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Derivative of the surface area (mm^2) by each vertex's position (mm); it points along the mean curvature normal."""
+    """Derivative of the surface area (mm^2) by vertex positions (mm); points along the mean curvature normal."""
     a, b, c = _corners(mesh.vertices, mesh.faces)
     normal = unit(np.cross(b - a, c - a))
     by_corner = np.stack([np.cross(c - b, normal), np.cross(a - c, normal), np.cross(b - a, normal)], axis=1) / -2.0

@@ -8,6 +8,7 @@ point moves along its normal by that change over the length of the field's gradi
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
+from scipy.special import expit
 
 from model.bundle import ShapeModel
 from model.inference.fitting import Fit
@@ -23,9 +24,7 @@ def laplace_covariance(fit: Fit) -> Float[np.ndarray, "p p"]:
 
 def fitted_logits(model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
     """Occupancy logits of the fitted shape at world points (mm)."""
-    parts = [
-        model.decoder.logits(fit.latent[None], fit.pose.to_canonical(chunk)[None])[0] for chunk in _chunks(points)
-    ]
+    parts = [model.decoder.logits(fit.latent[None], fit.pose.to_canonical(chunk)[None])[0] for chunk in _chunks(points)]
     return np.concatenate(parts) if parts else np.zeros(0, np.float32)
 
 
@@ -33,6 +32,8 @@ def fitted_jacobians(
     model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n p"], Float[np.ndarray, "n 3"]]:
     """Logits, their derivatives by (latent, pose step), and by world point (1/mm)."""
+    if not len(points):
+        return np.zeros(0), np.zeros((0, len(fit.precision))), np.zeros((0, 3))
     parts = [_jacobians(model, fit, chunk) for chunk in _chunks(points)]
     logits, by_parameter, by_point = (np.concatenate(values) for values in zip(*parts, strict=True))
     return logits, by_parameter, by_point
@@ -62,7 +63,7 @@ def logit_variance(
 
 def mean_probability(logits: Float[np.ndarray, "n"], variance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Expected sigmoid of a Gaussian logit (MacKay 1992, equation 10)."""
-    return np.asarray(1.0 / (1.0 + np.exp(-logits / np.sqrt(1.0 + np.pi * variance / 8.0))))
+    return np.asarray(expit(logits / np.sqrt(1.0 + np.pi * variance / 8.0)))
 
 
 def normal_displacements(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from scipy.special import expit
 
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
@@ -142,6 +142,8 @@ def _check(options: Options) -> None:
         raise InvalidParameter(
             f"resolution_mm is {step:g}; a grid step from {low:g} to {high:g} mm is accepted.", part="resolution_mm"
         )
+    if options.seed < 0:
+        raise InvalidParameter(f"seed is {options.seed}; a whole number from 0 is accepted.", part="seed")
 
 
 def _state(model: ShapeModel, observations: Observations, found: Fit, options: Options) -> ShapeState:
@@ -174,7 +176,7 @@ class _Section:
 
 def _sections(model: ShapeModel, found: Fit, observations: Observations) -> list[_Section]:
     logits = fitted_logits(model, found, observations.points)
-    error = observations.labels - 1.0 / (1.0 + np.exp(-logits.astype(float)))
+    error = observations.labels - expit(logits.astype(float))
     drawn, inside = observations.labels * observations.weights, (logits > 0) * observations.weights
     sections = []
     for number, plane in enumerate(observations.planes):

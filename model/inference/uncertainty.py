@@ -7,7 +7,8 @@ vertices have covariance ``F F^T`` (mm^2), by the Laplace posterior or over an e
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy.special import expit
 
 from model.bundle import ShapeModel
 from model.geometry import Grid
@@ -110,7 +111,7 @@ def _probabilities(model: ShapeModel, state: ShapeState, points: Float[np.ndarra
 
 def _voxels_in_box(
     model: ShapeModel, found: Fit, grid: Grid
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Indices and world positions of the voxels that lie in the model's canonical box."""
     half = canonical_box(model)
     corners = half * np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -119,7 +120,7 @@ def _voxels_in_box(
     high = np.clip(np.ceil(reach.max(axis=0)) + 1, 0, grid.shape).astype(int)
     axes = [np.arange(a, max(a, b)) for a, b in zip(low, high, strict=True)]
     index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = grid.to_world(index)
+    points = grid.to_world(index.astype(float))
     inside: Bool[np.ndarray, "n"] = (np.abs(found.pose.to_canonical(points)) <= half).all(axis=1)
     return index[inside], points[inside]
 
@@ -131,4 +132,4 @@ def voxel_entropy(probability: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s
 
 
 def _sigmoid(logits: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    return np.asarray(1.0 / (1.0 + np.exp(-logits.astype(float))))
+    return np.asarray(expit(logits.astype(float)))
