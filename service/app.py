@@ -119,6 +119,7 @@ def describe(app: FastAPI) -> dict[str, Any]:
     """The interface's description (OpenAPI), made once."""
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        _drop_foreign_errors(document)
         schemas = document["components"]["schemas"]
         for kind in (Problem, SurfaceSd):
             schemas[kind.__name__] = kind.model_json_schema(ref_template="#/components/schemas/{model}")
@@ -129,6 +130,16 @@ def describe(app: FastAPI) -> dict[str, Any]:
         document["security"] = [{}, {"key": []}, {"bearer": []}]
         app.openapi_schema = document
     return app.openapi_schema
+
+
+def _drop_foreign_errors(document: dict[str, Any]) -> None:
+    """Leave out the framework's own validation errors: no route answers with them."""
+    for item in document["paths"].values():
+        for operation in item.values():
+            if "application/json" in operation["responses"].get("422", {}).get("content", {}):
+                del operation["responses"]["422"]
+    for name in ("HTTPValidationError", "ValidationError"):
+        document["components"]["schemas"].pop(name, None)
 
 
 @asynccontextmanager

@@ -106,6 +106,7 @@ def model_description(model: ShapeModel, address: str) -> ModelDescription:
         active_dimensions=ActiveDimensions(percent_95=low, percent_97=middle, percent_99=high),
         half_extent_mm=list(manifest.half_extent_mm),
         resolution_mm=manifest.resolution_mm,
+        calibration=manifest.calibration,
         training=manifest.training,
         training_shapes=len(model.population.codes),
         licence=manifest.licence,

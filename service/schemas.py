@@ -228,6 +228,7 @@ class ModelDescription(ModelSummary):
     active_dimensions: ActiveDimensions
     half_extent_mm: list[float]
     resolution_mm: float
+    calibration: dict[str, object] = Field(description="how uncertainty was calibrated; empty when it was not")
     training: dict[str, object]
     training_shapes: int
     licence: str
