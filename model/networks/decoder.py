@@ -15,6 +15,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from model.errors import InvalidParameter
+
 
 @dataclass(frozen=True)
 class DecoderShape:
@@ -23,7 +25,7 @@ class DecoderShape:
     Attributes:
         latent_size: D.
         width: hidden units a layer.
-        depth: hidden layers.
+        depth: hidden layers, at least 2.
         extent_mm: half size of the cube that is scaled to [-1, 1].
         unit_columns: latent weights of unit norm a dimension.
     """
@@ -34,6 +36,10 @@ class DecoderShape:
     extent_mm: float = 32.0
     unit_columns: bool = True
 
+    def __post_init__(self) -> None:
+        if self.depth < 2:
+            raise InvalidParameter("The decoder has fewer than 2 hidden layers; 2 or more are accepted.", part="depth")
+
 
 class OccupancyDecoder(nn.Module):
     """``f_theta(z, u)`` before the sigmoid; points ``u`` in canonical mm."""
@@ -42,9 +48,11 @@ class OccupancyDecoder(nn.Module):
         super().__init__()
         self.shape = shape
         self.second_entry = shape.depth // 2
-        self.from_point = _linears([nn.Linear(3, shape.width) for _ in range(2)])
+        entries = nn.ModuleList([nn.Linear(3, shape.width) for _ in range(2)])
+        self.from_point = cast("Sequence[nn.Linear]", entries)
         self.from_latent = nn.Parameter(torch.randn(2 * shape.width, shape.latent_size) / shape.width**0.5)
-        self.hidden = _linears([nn.Linear(shape.width, shape.width) for _ in range(shape.depth - 1)])
+        hidden = nn.ModuleList([nn.Linear(shape.width, shape.width) for _ in range(shape.depth - 1)])
+        self.hidden = cast("Sequence[nn.Linear]", hidden)
         self.out = nn.Linear(shape.width, 1)
         self._initialise()
 
@@ -111,11 +119,6 @@ class OccupancyDecoder(nn.Module):
         by_latent = entries[0] @ first + entries[1] @ second
         by_point = entries[0] @ self.from_point[0].weight + entries[1] @ self.from_point[1].weight
         return logits, by_latent, by_point / self.shape.extent_mm
-
-
-def _linears(layers: list[nn.Linear]) -> Sequence[nn.Linear]:
-    """Layers registered with their module, typed as what they are."""
-    return cast("Sequence[nn.Linear]", nn.ModuleList(layers))
 
 
 def silu_slope(value: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
