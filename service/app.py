@@ -70,7 +70,6 @@ def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log
         version=INTERFACE_VERSION,
         description=DESCRIPTION,
         lifespan=partial(_lifespan, services=services, sweep=store.sweep, close=engine.close),
-        root_path=settings.root_path,
     )
     app.state.services = services
     _add_routes(app)

@@ -103,6 +103,7 @@ def serve(
         app,
         host=settings.host,
         port=settings.port,
+        root_path=settings.root_path,
         access_log=False,
         log_config=uvicorn_logging(settings.log_level),
         server_header=False,

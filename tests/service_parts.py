@@ -47,9 +47,9 @@ def app_for(folder: Path, *models: ShapeModel, log: StringIO | None = None, **ch
 
 
 @contextmanager
-def running(app: FastAPI, *, headers: Mapping[str, str] | None = None) -> Iterator[httpx.Client]:
+def running(app: FastAPI, *, headers: Mapping[str, str] | None = None, root_path: str = "") -> Iterator[httpx.Client]:
     """A client of a real server on a free port of this machine."""
-    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_config=None, access_log=False)
+    config = uvicorn.Config(app, host="127.0.0.1", port=0, root_path=root_path, log_config=None, access_log=False)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

@@ -1,0 +1,116 @@
+"""The program as people start it: `serve` in a process of its own, and commands on a terminal and in a pipe."""
+
+import os
+import pty
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import httpx
+
+from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, running
+
+PROGRAM = """
+import sys
+from service.cli import main
+from service.model_registry import ModelRegistry
+from tests.analytic_model import ellipsoid_model
+sys.exit(main(sys.argv[1:], lambda settings: ModelRegistry({"ellipsoid": ellipsoid_model("ellipsoid")})))
+"""
+
+
+def command(*words):
+    return [sys.executable, "-c", PROGRAM, *map(str, words)]
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@contextmanager
+def serving(repository, folder, **environment):
+    port = free_port()
+    variables = {**os.environ, "MORPHOFLOW_RESULTS_FOLDER": str(folder), **environment}
+    process = subprocess.Popen(
+        command("serve", "--port", port), cwd=repository, env=variables, stderr=subprocess.PIPE, text=True
+    )
+    address = f"http://127.0.0.1:{port}"
+    try:
+        while process.poll() is None:
+            try:
+                httpx.get(f"{address}/healthz")
+                break
+            except httpx.TransportError:
+                time.sleep(0.02)
+        yield process, address
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_serve_answers_prints_a_request_that_works_and_ends_when_told(repository, tmp_path):
+    (tmp_path / "mask.nii.gz").write_bytes(mask_bytes())
+    with serving(repository, tmp_path / "results") as (process, address):
+        made = httpx.post(f"{address}/v1/reconstructions", files=mask_parts(), timeout=60.0)
+        assert made.status_code == 201
+        process.send_signal(signal.SIGTERM)
+        told = process.communicate(timeout=60.0)[1]
+    assert process.returncode in (0, -signal.SIGTERM)
+    assert '"event": "stopped"' in told
+    (request,) = re.findall(r"curl .*", told)
+    assert address in request
+    assert '"event": "request"' in told
+    assert "Traceback" not in told
+
+
+def test_results_are_there_after_a_crash(repository, tmp_path):
+    with serving(repository, tmp_path / "results") as (process, address):
+        links = httpx.post(f"{address}/v1/reconstructions", files=mask_parts(), timeout=60.0).json()["links"]
+        process.kill()
+    with serving(repository, tmp_path / "results") as (_, address):
+        assert httpx.get(f"{address}{links['mesh']}", timeout=60.0).status_code == 200
+
+
+def run_on_terminal(repository, *words):
+    """Exit status, and what a terminal as standard error shows."""
+    master, slave = pty.openpty()
+    process = subprocess.Popen(command(*words), cwd=repository, stdout=subprocess.PIPE, stderr=slave)
+    os.close(slave)
+    process.communicate(timeout=120.0)
+    shown = b""
+    while True:
+        try:
+            data = os.read(master, 4096)
+        except OSError:
+            break
+        if not data:
+            break
+        shown += data
+    os.close(master)
+    return process.returncode, shown.decode(errors="replace")
+
+
+def test_a_bar_shows_on_a_terminal_and_none_in_a_pipe(repository, tmp_path):
+    status, shown = run_on_terminal(repository, "sample", "--count", 2, "--output", tmp_path / "a")
+    assert (status, "seed" in shown) == (0, True)
+    piped = subprocess.run(
+        command("sample", "--count", 2, "--output", tmp_path / "b"), cwd=repository, capture_output=True, check=True
+    )
+    assert piped.stderr == b""
+
+
+def test_behind_a_proxy_links_carry_its_prefix(tmp_path):
+    app = app_for(tmp_path, api_keys=("k",))
+    with running(app, headers={"X-API-Key": "k"}, root_path="/shape") as client:
+        made = client.post("/v1/reconstructions", files=mask_parts())
+        assert made.headers["location"].startswith("/shape/v1/reconstructions/")
+        assert client.get(made.headers["location"].removeprefix("/shape")).status_code == 200
+        assert client.get("/v1/models").json()["models"][0]["link"] == f"/shape/v1/models/{NAME}"
+        assert httpx.get(f"{client.base_url}/healthz").status_code == 200
+        assert httpx.get(f"{client.base_url}/v1/models").status_code == 401
