@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import httpx
 
-from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, running
+from tests.service_parts import NAME, app_for, mask_parts, running
 
 PROGRAM = """
 import sys
@@ -37,25 +37,26 @@ def free_port():
 def serving(repository, folder, **environment):
     port = free_port()
     variables = {**os.environ, "MORPHOFLOW_RESULTS_FOLDER": str(folder), **environment}
-    process = subprocess.Popen(
-        command("serve", "--port", port), cwd=repository, env=variables, stderr=subprocess.PIPE, text=True
-    )
-    address = f"http://127.0.0.1:{port}"
-    try:
-        while process.poll() is None:
-            try:
-                httpx.get(f"{address}/healthz")
-                break
-            except httpx.TransportError:
-                time.sleep(0.02)
-        yield process, address
-    finally:
-        process.kill()
-        process.wait()
+    words = command("serve", "--port", port)
+    with subprocess.Popen(words, cwd=repository, env=variables, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            wait_for(process, port)
+            yield process, f"http://127.0.0.1:{port}"
+        finally:
+            process.kill()
+
+
+def wait_for(process, port):
+    while process.poll() is None:
+        try:
+            httpx.get(f"http://127.0.0.1:{port}/healthz")
+        except httpx.TransportError:
+            time.sleep(0.02)
+        else:
+            return
 
 
 def test_serve_answers_prints_a_request_that_works_and_ends_when_told(repository, tmp_path):
-    (tmp_path / "mask.nii.gz").write_bytes(mask_bytes())
     with serving(repository, tmp_path / "results") as (process, address):
         made = httpx.post(f"{address}/v1/reconstructions", files=mask_parts(), timeout=60.0)
         assert made.status_code == 201
