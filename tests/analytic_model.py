@@ -4,7 +4,7 @@ It stands in for a trained bundle wherever a test is about what surrounds the mo
 """
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -47,6 +47,34 @@ class EllipsoidDecoder:
 
 
 @dataclass(frozen=True)
+class BentDecoder(EllipsoidDecoder):
+    """The same ellipsoids, bent along the curve ``(t, -p t^2, -q t^3)``: chiral, and of unchanged volume.
+
+    ``(x, y, z) -> (x, y + p x^2, z + q x^3)`` takes a bent shape back to the ellipsoid; its determinant is 1.
+    """
+
+    bend: float = 0.03
+    twist: float = 0.003
+
+    def logits(self, latent: Float[np.ndarray, "b 3"], points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n"]:
+        """Positive inside."""
+        return super().logits(latent, self._straight(points))
+
+    def logits_and_jacobians(
+        self, latent: Float[np.ndarray, "b 3"], points: Float[np.ndarray, "b n 3"]
+    ) -> tuple[Float[np.ndarray, "b n"], Float[np.ndarray, "b n 3"], Float[np.ndarray, "b n 3"]]:
+        """The same with derivatives by latent code and by point (per mm)."""
+        logits, by_latent, by_point = super().logits_and_jacobians(latent, self._straight(points))
+        x = points[..., 0]
+        along = by_point[..., 0] + 2.0 * self.bend * x * by_point[..., 1] + 3.0 * self.twist * x**2 * by_point[..., 2]
+        return logits, by_latent, np.concatenate([along[..., None], by_point[..., 1:]], axis=-1)
+
+    def _straight(self, points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
+        x, y, z = np.moveaxis(points, -1, 0)
+        return np.stack([x, y + self.bend * x**2, z + self.twist * x**3], axis=-1)
+
+
+@dataclass(frozen=True)
 class StandardNormalPrior:
     """``z ~ N(0, I)``; its flow is the identity."""
 
@@ -80,6 +108,11 @@ def ellipsoid_model(name: str = "ellipsoid", mean_axes: tuple[float, float, floa
     population = Population(codes, codes, prior.log_density(codes)[0], volumes)
     digest = hashlib.sha256(f"{name} {mean_axes}".encode()).hexdigest()
     return ShapeModel(_manifest(name, mean_axes), digest, population, decoder, prior)
+
+
+def bent_model() -> ShapeModel:
+    """The bent family: its shapes differ from their mirror images however they are turned."""
+    return replace(ellipsoid_model("bent"), decoder=BentDecoder())
 
 
 def _manifest(name: str, mean_axes: tuple[float, float, float]) -> Manifest:

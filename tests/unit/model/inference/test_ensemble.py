@@ -1,0 +1,114 @@
+"""Refits under random weights of the planes: many, repeatable, and spread where the drawing leaves room."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from model.geometry import Pose
+from model.inference.ensemble import MEMBERS, fit_ensemble
+from model.inference.fitting import FitOptions, FitStatus, fit
+from model.inference.posterior import laplace_covariance
+from tests.analytic_model import EllipsoidDecoder, StandardNormalPrior, bent_model, ellipsoid_model
+from tests.analytic_shapes import Ellipsoid
+from tests.drawn_shapes import ORTHOGONAL, PARALLEL, DecodedShape, cube_around, drawn, observed
+
+CENTRE = np.array([30.0, -20.0, 50.0])
+MODEL = ellipsoid_model()
+OBSERVATIONS = observed(drawn(Ellipsoid((14.0, 8.0, 6.0), CENTRE), cube_around(CENTRE)))
+FOUND = fit(MODEL, OBSERVATIONS, FitOptions())
+
+
+@dataclass(frozen=True)
+class WidePrior(StandardNormalPrior):
+    """``z0 = 10 z``: codes are ten times narrower than their base."""
+
+    def to_base(self, latent):
+        return 10.0 * latent
+
+    def from_base(self, base):
+        return base / 10.0
+
+    def base_jacobian(self, latent):
+        return 10.0 * latent, np.broadcast_to(10.0 * np.eye(3), (len(latent), 3, 3))
+
+
+@dataclass(frozen=True)
+class ListeningDecoder(EllipsoidDecoder):
+    """Keeps every code that it was asked about."""
+
+    heard: list[np.ndarray] = field(default_factory=list)
+
+    def logits_and_jacobians(self, latent, points):
+        self.heard.append(latent[0])
+        return super().logits_and_jacobians(latent, points)
+
+
+@pytest.fixture(scope="module")
+def members():
+    return fit_ensemble(MODEL, OBSERVATIONS, FOUND, seed=1)
+
+
+def same(first, second):
+    return np.array_equal(first.latent, second.latent) and np.array_equal(first.pose.position, second.pose.position)
+
+
+def test_as_many_as_in_the_paper(members):
+    assert len(members) == MEMBERS == 25
+
+
+def test_a_function_of_the_seed(members):
+    again, other = (fit_ensemble(MODEL, OBSERVATIONS, FOUND, seed=seed) for seed in (1, 2))
+    assert all(same(a, b) for a, b in zip(members, again, strict=True))
+    assert not any(same(a, b) for a, b in zip(members, other, strict=True))
+
+
+def test_as_many_as_asked_for():
+    assert len(fit_ensemble(MODEL, OBSERVATIONS, FOUND, seed=1, members=3)) == 3
+
+
+def test_members_differ_and_surround_the_fit(members):
+    latents = np.array([member.latent for member in members])
+    assert len(np.unique(latents, axis=0)) == MEMBERS
+    assert all(member.status is FitStatus.CONVERGED for member in members)
+    assert (latents.std(axis=0) > 1e-3).all()
+    posterior = np.sqrt(np.diag(laplace_covariance(FOUND)))[:3]
+    assert (np.abs(latents.mean(axis=0) - FOUND.latent) < 0.5 * posterior).all()
+
+
+def test_uncertain_where_the_planes_disagree():
+    """Planes of one ellipsoid leave the position known; a shifted plane makes it depend on their weights."""
+    stack = drawn(Ellipsoid((14.0, 9.0, 7.0), CENTRE), cube_around(CENTRE), PARALLEL)
+    foreground = stack.foreground.copy()
+    foreground[:, :, 23] = np.roll(foreground[:, :, 23], 4, axis=0)
+    spreads = []
+    for each in (stack, replace(stack, foreground=foreground)):
+        observations = observed(each, PARALLEL)
+        found = fit(MODEL, observations, FitOptions())
+        ensemble = fit_ensemble(MODEL, observations, found, seed=0)
+        spreads.append(np.std([member.pose.position[0] for member in ensemble]))
+    assert spreads[1] > 5.0 * spreads[0]
+
+
+def test_members_keep_the_side():
+    model = bent_model()
+    shape = DecodedShape(model, np.zeros(3), Pose(CENTRE, mirrored=True))
+    observations = observed(drawn(shape, cube_around(CENTRE)))
+    found = fit(model, observations, FitOptions(mirror="always"))
+    assert all(member.pose.mirrored for member in fit_ensemble(model, observations, found, seed=0, members=3))
+
+
+def test_starts_are_spread_by_half_a_prior_standard_deviation():
+    heard = []
+    for seed in range(60):
+        decoder = ListeningDecoder()
+        model = replace(MODEL, decoder=decoder, prior=WidePrior())
+        found = replace(FOUND, latent=np.full(3, 0.01))
+        fit_ensemble(model, OBSERVATIONS, found, seed, members=1)
+        heard.append(decoder.heard[0])
+    assert np.std(np.array(heard) - 0.01) == pytest.approx(0.05, rel=0.2)
+
+
+def test_planes_without_observations_are_no_obstacle():
+    wider = replace(OBSERVATIONS, planes=(*ORTHOGONAL, *PARALLEL))
+    assert len(fit_ensemble(MODEL, wider, FOUND, seed=0, members=2)) == 2

@@ -1,0 +1,252 @@
+"""Spread of figures, surfaces and voxels against draws of analytic ellipsoids."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import expit
+
+from model.geometry import POSE_SIZE, Grid, Pose
+from model.inference.fitting import Fit, FitOptions, FitStatus, fit
+from model.inference.mesh import Mesh, area_cm2, area_gradient, empty_mesh, vertex_normals, volume_ml
+from model.inference.posterior import (
+    fitted_jacobians,
+    laplace_covariance,
+    logit_variance,
+    mean_probability,
+    parameter_draws,
+)
+from model.inference.surface import canonical_box, surface_of
+from model.inference.uncertainty import (
+    NINETY_PERCENT,
+    Estimate,
+    ShapeState,
+    area_estimate,
+    displacement_factors,
+    occupancy,
+    volume_estimate,
+    voxel_entropy,
+)
+from tests.analytic_model import ellipsoid_model
+from tests.analytic_shapes import Ellipsoid
+from tests.drawn_shapes import PARALLEL, cube_around, drawn, observed, rotation
+
+CENTRE = np.array([30.0, -20.0, 50.0])
+MODEL = ellipsoid_model()
+POSE = Pose(CENTRE, rotation(25.0, (1.0, -1.0, 2.0)), 0.1, mirrored=True)
+FIT = Fit(np.array([0.8, -0.4, -0.9]), POSE, FitStatus.CONVERGED, "", 1, 0.0, np.eye(3 + POSE_SIZE))
+MESH = surface_of(MODEL, FIT.latent, POSE, 0.7)
+directions = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
+
+
+def moved(step):
+    return replace(FIT, latent=FIT.latent + step[:3], pose=FIT.pose.moved(step[3:]))
+
+
+def ellipsoid_of(found):
+    return Ellipsoid(tuple(MODEL.decoder.axes(found.latent[None])[0] * np.exp(-found.pose.log_scale)))
+
+
+def covariance_of(**spread):
+    """Diagonal, with standard deviations of ``latent``, ``position``, ``rotation`` and ``scale``."""
+    deviations = np.full(3 + POSE_SIZE, 1e-9)
+    for name, part in (("latent", slice(0, 3)), ("position", slice(3, 6)), ("rotation", slice(6, 9)), ("scale", 9)):
+        deviations[part] = spread.get(name, 1e-9)
+    return np.diag(deviations**2)
+
+
+def half_width(estimate: Estimate):
+    assert estimate.low is not None
+    assert estimate.high is not None
+    assert estimate.low <= estimate.value <= estimate.high
+    return (estimate.high - estimate.low) / 2.0
+
+
+def fitted_covariance():
+    observations = observed(drawn(Ellipsoid((14.0, 9.0, 6.0), CENTRE), cube_around(CENTRE)))
+    return laplace_covariance(fit(MODEL, observations, FitOptions()))
+
+
+@pytest.mark.parametrize("covariance", [covariance_of(latent=(0.1, 0.2, 0.05), scale=0.01), fitted_covariance()])
+def test_intervals_are_those_of_draws_from_the_posterior(covariance):
+    factors = displacement_factors(MODEL, ShapeState((FIT,), covariance), MESH)
+    shapes = [ellipsoid_of(moved(step)) for step in parameter_draws(covariance, 4000, seed=0)]
+    for estimate, drawn_figures in (
+        (volume_estimate(MESH, factors), [shape.volume_ml for shape in shapes]),
+        (area_estimate(MESH, factors), [shape.area_cm2 for shape in shapes]),
+    ):
+        assert half_width(estimate) == pytest.approx(NINETY_PERCENT * np.std(drawn_figures), rel=0.06)
+        low, high = np.quantile(drawn_figures, [0.05, 0.95])
+        assert (estimate.low, estimate.high) == pytest.approx((low, high), rel=0.02)
+
+
+def test_intervals_are_those_of_meshes_of_draws():
+    covariance = covariance_of(latent=(0.1, 0.2, 0.05), position=0.5, rotation=0.1, scale=0.01)
+    factors = displacement_factors(MODEL, ShapeState((FIT,), covariance), MESH)
+    fits = [moved(step) for step in parameter_draws(covariance, 200, seed=0)]
+    meshes = [surface_of(MODEL, each.latent, each.pose, 1.5) for each in fits]
+    for estimate, figure in ((volume_estimate(MESH, factors), volume_ml), (area_estimate(MESH, factors), area_cm2)):
+        spread = np.std([figure(mesh) for mesh in meshes])
+        assert half_width(estimate) == pytest.approx(NINETY_PERCENT * spread, rel=0.15)
+
+
+def test_surface_spread_of_each_parameter():
+    canonical, outward = POSE.to_canonical(MESH.vertices), MESH.normals
+    spreads = {
+        "position": (0.4 * np.ones(len(outward)), covariance_of(position=0.4)),
+        "scale": (0.05 * np.abs(np.sum((MESH.vertices - CENTRE) * outward, axis=1)), covariance_of(scale=0.05)),
+        "rotation": (
+            0.1 * np.linalg.norm(np.cross(canonical, outward @ POSE.linear.T), axis=1) * np.exp(-2 * POSE.log_scale),
+            covariance_of(rotation=0.1),
+        ),
+    }
+    for name, (expected, covariance) in spreads.items():
+        factors = displacement_factors(MODEL, ShapeState((FIT,), covariance), MESH)
+        np.testing.assert_allclose(np.linalg.norm(factors, axis=1), expected, rtol=0.01, atol=1e-3, err_msg=name)
+
+
+def test_moving_a_shape_changes_no_figure():
+    covariance = covariance_of(position=1.0, rotation=0.1)
+    factors = displacement_factors(MODEL, ShapeState((FIT,), covariance), MESH)
+    assert half_width(volume_estimate(MESH, factors)) < 2e-3 * volume_ml(MESH)
+    assert half_width(area_estimate(MESH, factors)) < 5e-3 * area_cm2(MESH)
+
+
+def test_ensemble_spread_is_that_of_its_members():
+    shifts = np.random.default_rng(0).normal(scale=0.3, size=25)
+    members = tuple(
+        replace(FIT, pose=Pose(CENTRE + np.array([s, 0.0, 0.0]), POSE.rotation, 0.1, mirrored=True)) for s in shifts
+    )
+    factors = displacement_factors(MODEL, ShapeState((FIT, *members), None), MESH)
+    expected = np.std(shifts, ddof=1) * np.abs(MESH.normals[:, 0])
+    np.testing.assert_allclose(np.linalg.norm(factors, axis=1), expected, atol=0.02)
+
+
+def test_ensemble_interval_is_that_of_its_volumes():
+    steps = parameter_draws(covariance_of(latent=(0.1, 0.2, 0.05)), 24, seed=3)
+    members = tuple(moved(step) for step in steps)
+    factors = displacement_factors(MODEL, ShapeState((FIT, *members), None), MESH)
+    spread = np.std([ellipsoid_of(member).volume_ml for member in members], ddof=1)
+    assert half_width(volume_estimate(MESH, factors)) == pytest.approx(NINETY_PERCENT * spread, rel=0.1)
+
+
+def test_no_intervals_without_uncertainty():
+    assert displacement_factors(MODEL, ShapeState((FIT,), None), MESH) is None
+    assert volume_estimate(MESH, None) == Estimate(volume_ml(MESH), None, None)
+    assert area_estimate(MESH, None) == Estimate(area_cm2(MESH), None, None)
+
+
+def test_empty_surface_has_empty_factors():
+    factors = displacement_factors(MODEL, ShapeState((FIT,), covariance_of(latent=0.1)), empty_mesh())
+    assert factors.shape == (0, 3 + POSE_SIZE)
+    assert volume_estimate(empty_mesh(), factors) == Estimate(0.0, 0.0, 0.0)
+
+
+def test_intervals_do_not_go_below_zero():
+    factors = displacement_factors(MODEL, ShapeState((FIT,), covariance_of(latent=20.0)), MESH)
+    assert volume_estimate(MESH, factors).low == 0.0
+
+
+def test_area_gradient_against_differences():
+    rng = np.random.default_rng(0)
+    for number in rng.choice(len(MESH.vertices), 6, replace=False):
+        for axis in range(3):
+            areas = []
+            for side in (1e-4, -1e-4):
+                vertices = MESH.vertices.copy()
+                vertices[number, axis] += side
+                areas.append(area_cm2(Mesh(vertices, MESH.faces, MESH.normals)) * 100.0)
+            assert area_gradient(MESH)[number, axis] == pytest.approx((areas[0] - areas[1]) / 2e-4, abs=1e-5)
+
+
+def test_area_slope_of_a_growing_ball_is_that_of_its_radius():
+    ball = surface_of(ellipsoid_model(mean_axes=(10.0, 10.0, 10.0)), np.zeros(3), Pose(), 0.7)
+    assert vertex_normals(ball.vertices, ball.faces).shape == ball.normals.shape
+    total = np.sum(area_gradient(ball) * ball.normals)
+    assert total == pytest.approx(8.0 * np.pi * 10.0, rel=0.02)
+
+
+@given(st.floats(0.0, 1.0))
+def test_entropy_is_bounded_symmetric_and_greatest_at_a_half(probability):
+    values = voxel_entropy(np.array([probability, 1.0 - probability, 0.5]))
+    assert 0.0 <= values[0] <= np.float32(np.log(2.0))
+    assert values[0] == pytest.approx(values[1], abs=1e-6)
+    assert values[2] == np.float32(np.log(2.0))
+    if abs(probability - 0.5) > 0.01:
+        assert values[0] < values[2]
+
+
+def test_entropy_against_its_definition():
+    p = np.linspace(0.01, 0.99, 99).reshape(3, 3, 11)
+    np.testing.assert_allclose(voxel_entropy(p), -p * np.log(p) - (1 - p) * np.log(1 - p), rtol=1e-5)
+    np.testing.assert_allclose(voxel_entropy(np.array([0.0, 1.0])), 0.0, atol=1e-9)
+
+
+@st.composite
+def grids(draw):
+    """Grids near the shape: anisotropic, oblique, flipped or not."""
+    turn = rotation(draw(st.floats(-180.0, 180.0)), draw(directions.filter(lambda v: np.linalg.norm(v) > 0.1)))
+    spacing = np.array([draw(st.floats(0.5, 6.0)) for _ in range(3)])
+    affine = np.eye(4)
+    affine[:3, :3] = turn * spacing * [draw(st.sampled_from([-1.0, 1.0])) for _ in range(3)]
+    shape = tuple(draw(st.integers(1, 14)) for _ in range(3))
+    affine[:3, 3] = CENTRE + np.array(draw(directions)) * 12.0 - affine[:3, :3] @ (np.array(shape) / 2.0)
+    return Grid(shape, affine)
+
+
+def split(grid):
+    points = grid.centres()
+    canonical = POSE.to_canonical(points)
+    distance = np.abs(canonical) - canonical_box(MODEL)
+    return points, canonical, distance.max(axis=1)
+
+
+@settings(max_examples=60)
+@given(grids())
+def test_occupancy_is_that_of_the_shape_and_zero_outside_the_box(grid):
+    values = occupancy(MODEL, ShapeState((FIT,), None), grid)
+    assert values.shape == grid.shape
+    _, canonical, beyond = split(grid)
+    exact = expit(MODEL.decoder.logits(FIT.latent[None], canonical[None])[0])
+    flat = values.reshape(-1)
+    np.testing.assert_allclose(flat[beyond < -1e-9], exact[beyond < -1e-9], atol=1e-6)
+    np.testing.assert_array_equal(flat[beyond > 1e-9], 0.0)
+
+
+@settings(max_examples=20)
+@given(grids())
+def test_uncertain_occupancy_is_the_posterior_mean(grid):
+    covariance = fitted_covariance() * 9.0
+    values = occupancy(MODEL, ShapeState((FIT,), covariance), grid).reshape(-1)
+    points, _, beyond = split(grid)
+    logits, by_parameter, _ = fitted_jacobians(MODEL, FIT, points)
+    exact = np.where(beyond < 0, mean_probability(logits, logit_variance(by_parameter, covariance)), 0.0)
+    near = np.abs(logits) < 12.0
+    np.testing.assert_allclose(values[near], exact[near], atol=1e-6)
+    np.testing.assert_allclose(values[~near & (beyond < 0)], expit(logits[~near & (beyond < 0)]), atol=1e-6)
+
+
+def test_ensemble_occupancy_is_the_mean_of_its_members():
+    members = tuple(moved(step) for step in parameter_draws(covariance_of(latent=0.3, position=0.5), 6, seed=0))
+    grid = cube_around(CENTRE, step=2.0, nodes=15)
+    values = occupancy(MODEL, ShapeState((FIT, *members), None), grid).reshape(-1)
+    single = [occupancy(MODEL, ShapeState((member,), None), grid).reshape(-1) for member in members]
+    inside = split(grid)[2] < -3.0
+    assert inside.any()
+    np.testing.assert_allclose(values[inside], np.mean(single, axis=0)[inside], atol=1e-6)
+
+
+def test_grid_far_from_the_shape_is_empty():
+    assert not occupancy(MODEL, ShapeState((FIT,), None), cube_around(CENTRE + 500.0, nodes=5)).any()
+
+
+def test_uncertainty_is_greatest_between_drawn_planes():
+    observations = observed(drawn(Ellipsoid((14.0, 9.0, 7.0), CENTRE), cube_around(CENTRE), PARALLEL[:3]), PARALLEL[:3])
+    found = fit(MODEL, observations, FitOptions())
+    mesh = surface_of(MODEL, found.latent, found.pose, 1.0)
+    factors = displacement_factors(MODEL, ShapeState((found,), laplace_covariance(found)), mesh)
+    spread = np.linalg.norm(factors, axis=1)
+    drawn_side = mesh.vertices[:, 2] < CENTRE[2]
+    assert spread[~drawn_side].max() > 1.5 * spread[drawn_side].max()
