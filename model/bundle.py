@@ -25,6 +25,8 @@ REQUIRED_FILES = (
     "prior_density.onnx",
     "prior_base_jacobian.onnx",
 )
+#: Suffix of each backend's graphs.
+SUFFIXES: dict[BackendName, str] = {"onnx": ".onnx", "torchscript": ".pt"}
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ def open_bundle(folder: Path, *, backend: BackendName = "onnx", threads: int | N
         BundleIncomplete, BundleCorrupt, BundleTooNew: it cannot be trusted; the sentence says why.
     """
     manifest, digest = read_manifest(folder)
+    _check_listed(folder, manifest, SUFFIXES[backend])
     for name, expected in manifest.files.items():
         _check_file(folder / name, expected)
     load = {"onnx": load_onnx, "torchscript": load_torchscript}[backend]
@@ -117,7 +120,7 @@ def read_manifest(folder: Path) -> tuple[Manifest, str]:
     try:
         values = json.loads(data)
         written = int(values.pop("format"))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise BundleCorrupt(f"{MANIFEST} cannot be parsed; one written by morphoflow export is accepted.") from error
     if written > FORMAT:
         raise BundleTooNew(f"The bundle has format {written}; this program reads formats up to {FORMAT}.")
@@ -136,10 +139,27 @@ def _manifest_of(values: dict[str, Any]) -> Manifest:
     if missing:
         raise BundleCorrupt(f"{MANIFEST} lacks {', '.join(missing)}; one written by morphoflow export is accepted.")
     values = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items() if name in known}
-    unlisted = [name for name in REQUIRED_FILES if name not in values["files"]]
+    files = values["files"]
+    if not isinstance(files, dict) or not all(_is_plain(name) for name in files):
+        raise BundleCorrupt(f"{MANIFEST} lists files outside the bundle; names of files beside it are accepted.")
+    unlisted = [name for name in REQUIRED_FILES if name not in files]
     if unlisted:
         raise BundleIncomplete(f"{MANIFEST} lists no {', '.join(unlisted)}; export the model anew.")
     return Manifest(**values)
+
+
+def _is_plain(name: str) -> bool:
+    """Whether a file of this name lies in the bundle's folder itself, on any system."""
+    return name not in ("", ".", "..") and not set(name) & set("/\\:\0")
+
+
+def _check_listed(folder: Path, manifest: Manifest, suffix: str) -> None:
+    """Every graph that would be loaded stands in the manifest: none was slipped in beside those it vouches for."""
+    loaded = {f"{graph}{suffix}" for graph in ("decoder_logits", "decoder_jacobians", "prior_density")}
+    loaded |= {path.name for path in folder.glob(f"*{suffix}")}
+    unlisted = sorted(loaded - manifest.files.keys())
+    if unlisted:
+        raise BundleCorrupt(f"{MANIFEST} does not list {', '.join(unlisted)}; export or copy the bundle anew.")
 
 
 def _check_file(path: Path, expected: str) -> None:

@@ -110,15 +110,18 @@ class ScriptedDensity(nn.Module):
 
 
 class SamplingStepGraph(nn.Module):
-    """``prior_sampling_K``."""
+    """``prior_sampling_K``, in the prior's own units before and after."""
 
-    def __init__(self, transform: SplineTransform) -> None:
+    scale: Tensor
+
+    def __init__(self, transform: SplineTransform, scale: Tensor) -> None:
         super().__init__()
         self.transform = transform
+        self.register_buffer("scale", scale.detach().clone())
 
     def forward(self, target: Tensor, guess: Tensor) -> Tensor:
         """The next guess."""
-        return self.transform.inverse_step(target, guess)
+        return self.transform.inverse_step(target / self.scale, guess / self.scale) * self.scale
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,8 @@ class GraphSpec:
 def graph_specs(decoder: OccupancyDecoder, prior: LatentPrior) -> list[GraphSpec]:
     """All graphs of a bundle."""
     logits, jacobians, density = LogitsGraph(decoder), JacobiansGraph(decoder), DensityGraph(prior)
-    steps = [SamplingStepGraph(step) for step in prior.flow.transforms] if prior.shape.use_flow else []
+    transforms = prior.flow.transforms if prior.shape.use_flow else ()
+    steps = [SamplingStepGraph(transform, prior.flow_scale()) for transform in transforms]
     where, derivatives = ("latent", "points"), ("logits", "by_latent", "by_point")
     return [
         GraphSpec("decoder_logits", logits, where, ("logits",), logits),
@@ -169,7 +173,7 @@ def export_graphs(decoder: OccupancyDecoder, prior: LatentPrior, folder: Path) -
         if spec.scripted is not None:
             torch.jit.save(_scripted(spec.scripted, spec, size, extent), folder / f"{spec.name}.pt")
             written.append(f"{spec.name}.pt")
-        _check_parity(spec, folder, size, extent)
+        check_parity(spec, folder, size, extent)
     return written
 
 
@@ -199,7 +203,12 @@ def _scripted(module: nn.Module, spec: GraphSpec, size: int, extent: float) -> t
     return traced
 
 
-def _check_parity(spec: GraphSpec, folder: Path, size: int, extent: float) -> None:
+def check_parity(spec: GraphSpec, folder: Path, size: int, extent: float) -> None:
+    """Compare a graph's files with its module at several batch sizes and numbers of points.
+
+    Raises:
+        ParityError: they differ by more than `PARITY_TOLERANCE`.
+    """
     session = onnxruntime.InferenceSession(folder / f"{spec.name}.onnx", providers=["CPUExecutionProvider"])
     for batch, points in ((1, 1), (2, 257), (5, 64)):
         example = spec.example(size, extent, batch, points, seed=batch)

@@ -48,14 +48,15 @@ class LatentPrior(nn.Module):
         """Standard deviations of the base, ``alpha^-1/2``."""
         return self.log_sigma.exp()
 
-    def _scale(self) -> Float[Tensor, "d"]:
+    def flow_scale(self) -> Float[Tensor, "d"]:
+        """Unit of the flow along each dimension."""
         return self.sigma if self.shape.standardise else torch.ones_like(self.log_sigma)
 
     def to_base(self, latent: Float[Tensor, "b d"]) -> tuple[Float[Tensor, "b d"], Float[Tensor, "b"]]:
         """``z0 = g(z)`` and ``log |det dg/dz|``."""
         if not self.shape.use_flow:
             return latent, torch.zeros_like(latent[..., 0])
-        scale = self._scale()
+        scale = self.flow_scale()
         base, log_det = self.flow(latent / scale)
         return base * scale, log_det
 
@@ -63,7 +64,7 @@ class LatentPrior(nn.Module):
         """``z = g^-1(z0)``."""
         if not self.shape.use_flow:
             return base
-        scale = self._scale()
+        scale = self.flow_scale()
         return self.flow.inverse(base / scale) * scale
 
     def log_density(self, latent: Float[Tensor, "b d"]) -> Float[Tensor, "b"]:

@@ -80,7 +80,7 @@ def load(folder: Path, latent_size: int, threads: int | None) -> tuple[ScriptDec
 
 
 def _tensor(values: Float[np.ndarray, "..."]) -> Tensor:
-    return torch.as_tensor(np.ascontiguousarray(values, dtype=np.float32))
+    return torch.from_numpy(np.array(values, dtype=np.float32, order="C"))
 
 
 def _array(values: Tensor) -> Float[np.ndarray, "..."]:

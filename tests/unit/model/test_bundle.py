@@ -1,0 +1,168 @@
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.bundle import FORMAT, MANIFEST, POPULATION, REQUIRED_FILES, open_bundle, read_manifest, write_manifest
+from model.errors import BundleCorrupt, BundleError, BundleIncomplete, BundleTooNew
+from tests.random_networks import DECODER, manifest_of
+
+pytestmark = [
+    pytest.mark.xdist_group("exported"),
+    pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning"),
+]
+
+
+@pytest.fixture
+def bundle(exported, tmp_path):
+    return shutil.copytree(exported.folder, tmp_path / "secret_folder")
+
+
+def edit(bundle, **values):
+    path = bundle / MANIFEST
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+
+def refusal(bundle, kind: type[BundleError], naming: str, backend="onnx") -> str:
+    with pytest.raises(kind) as caught:
+        open_bundle(bundle, backend=backend)
+    sentence = str(caught.value)
+    assert naming in sentence
+    assert "secret_folder" not in sentence
+    assert "/" not in sentence
+    assert sentence.endswith(".")
+    assert "\n" not in sentence
+    return sentence
+
+
+@pytest.mark.parametrize("backend", ["onnx", "torchscript"])
+def test_an_untouched_bundle_opens(bundle, backend):
+    model = open_bundle(bundle, backend=backend, threads=1)
+    assert model.manifest.name == "random"
+    assert model.population.codes.shape == (5, 3)
+    np.testing.assert_array_equal(model.population.base_codes, 2 * model.population.codes)
+    logits = model.decoder.logits(np.zeros((2, 3)), DECODER.extent_mm * np.ones((2, 4, 3)))
+    assert logits.shape == (2, 4)
+    assert model.prior.from_base(np.zeros((2, 3))).shape == (2, 3)
+
+
+def test_the_digest_is_the_hash_of_the_manifest_and_changes_with_any_file(bundle):
+    expected = hashlib.sha256((bundle / MANIFEST).read_bytes()).hexdigest()
+    assert open_bundle(bundle).digest == read_manifest(bundle)[1] == expected
+    with (bundle / POPULATION).open("ab") as stream:
+        stream.write(b" ")
+    files = [path.name for path in bundle.iterdir() if path.name != MANIFEST]
+    write_manifest(manifest_of(bundle, files), bundle)
+    assert read_manifest(bundle)[1] != expected
+
+
+def test_writing_undoes_reading(bundle, tmp_path):
+    manifest, digest = read_manifest(bundle)
+    write_manifest(manifest, tmp_path)
+    assert read_manifest(tmp_path) == (manifest, digest)
+    assert manifest == manifest_of(bundle, list(manifest.files))
+
+
+def test_a_later_format_is_refused(bundle):
+    edit(bundle, format=FORMAT + 1)
+    assert f"up to {FORMAT}" in refusal(bundle, BundleTooNew, f"format {FORMAT + 1}")
+
+
+def test_what_a_manifest_says_beyond_this_format_is_passed_over(bundle):
+    edit(bundle, colour="blue")
+    assert open_bundle(bundle).manifest.name == "random"
+
+
+@pytest.mark.parametrize("name", [POPULATION, "decoder_logits.onnx", "prior_sampling_1.onnx", "decoder_logits.pt"])
+def test_a_missing_file_is_named(bundle, name):
+    (bundle / name).unlink()
+    refusal(bundle, BundleIncomplete, name)
+
+
+@pytest.mark.parametrize("name", [POPULATION, "decoder_logits.onnx", "prior_sampling_1.onnx", "decoder_logits.pt"])
+def test_a_file_with_one_other_bit_is_named(bundle, name):
+    data = bytearray((bundle / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (bundle / name).write_bytes(data)
+    refusal(bundle, BundleCorrupt, name)
+
+
+def test_a_folder_without_a_manifest_is_refused(bundle):
+    (bundle / MANIFEST).unlink()
+    refusal(bundle, BundleIncomplete, MANIFEST)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"3",
+        b'"text"',
+        b"null",
+        b"\xff\xfe\xfa",
+        b"\x89PNG",
+        b"{}",
+        b'{"format": null}',
+        b'{"format": "one"}',
+        b'{"format": Infinity}',
+        b"[" * 100_000,
+        b'{"format": 1}',
+    ],
+)
+def test_an_unparsable_manifest_is_refused(bundle, content):
+    (bundle / MANIFEST).write_bytes(content)
+    refusal(bundle, BundleCorrupt, MANIFEST)
+
+
+@pytest.mark.parametrize("name", ["licence", "latent_size", "sigmas", "files"])
+def test_what_a_manifest_lacks_is_named(bundle, name):
+    values = json.loads((bundle / MANIFEST).read_text())
+    del values[name]
+    (bundle / MANIFEST).write_text(json.dumps(values))
+    refusal(bundle, BundleCorrupt, f"lacks {name}")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../x", "..", ".", "", "/etc/hostname", "sub/x.onnx", "..\\x", "C:x", "a\0b", "./decoder_logits.onnx"],
+)
+def test_files_outside_the_bundle_are_never_looked_at(bundle, name):
+    (bundle.parent / "x").write_bytes(b"outside")
+    files = json.loads((bundle / MANIFEST).read_text())["files"]
+    edit(bundle, files={**files, name: hashlib.sha256(b"outside").hexdigest()})
+    refusal(bundle, BundleCorrupt, MANIFEST)
+
+
+@pytest.mark.parametrize("files", [None, [], ["decoder_logits.onnx"], "population.npz", 3])
+def test_a_list_of_files_of_another_kind_is_refused(bundle, files):
+    edit(bundle, files=files)
+    refusal(bundle, BundleCorrupt, MANIFEST)
+
+
+@pytest.mark.parametrize("name", REQUIRED_FILES)
+def test_files_that_every_bundle_needs_must_be_listed(bundle, name):
+    files = json.loads((bundle / MANIFEST).read_text())["files"]
+    del files[name]
+    edit(bundle, files=files)
+    refusal(bundle, BundleIncomplete, name)
+
+
+@pytest.mark.parametrize(("suffix", "backend"), [(".onnx", "onnx"), (".pt", "torchscript")])
+def test_a_graph_that_the_manifest_does_not_vouch_for_is_refused(bundle, suffix, backend):
+    name = f"prior_sampling_2{suffix}"
+    shutil.copy(bundle / f"prior_sampling_0{suffix}", bundle / name)
+    refusal(bundle, BundleCorrupt, name, backend)
+
+
+def test_torchscript_graphs_must_be_listed_to_be_used(bundle):
+    manifest, _ = read_manifest(bundle)
+    for path in bundle.glob("*.pt"):
+        path.unlink()
+    write_manifest(replace(manifest, files={n: h for n, h in manifest.files.items() if not n.endswith(".pt")}), bundle)
+    assert open_bundle(bundle, backend="onnx").manifest.name == "random"
+    refusal(bundle, BundleCorrupt, "decoder_logits.pt", backend="torchscript")
