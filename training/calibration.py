@@ -1,8 +1,8 @@
 """How much a drawn mm^2 is worth: the likelihood precision, chosen on validation shapes.
 
-Neighbouring voxels are not independent, so the sum of their log likelihoods overstates what a slice tells. Each candidate
-precision is judged by the cross-entropy of the posterior mean occupancy on voxels that were not drawn, near the true
-surface: a proper score, lowest where the fit is accurate and its uncertainty honest.
+Neighbouring voxels are not independent, so the sum of their log likelihoods overstates what a slice tells. Each
+candidate is judged by the cross-entropy of the posterior mean occupancy on voxels near the true surface: a proper
+score, lowest where the fit is accurate and its uncertainty honest.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,15 +14,17 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from model.bundle import ShapeModel, open_bundle, write_manifest
-from model.inference.reconstruction import Options, reconstruct
-from model.inference.uncertainty import occupancy
+from model.inference.fitting import FitOptions, fit
+from model.inference.observations import observe
+from model.inference.posterior import fitted_jacobians, laplace_covariance, logit_variance, mean_probability
+from model.inference.reconstruction import OBSERVATION_BUDGET
 from training.cohorts.cohort import Case, Cohort
 from training.config import Regime
 from training.sparsify import for_evaluation
 
 #: Precisions that are tried (1/mm^2), and the regimes that they are tried on.
 CANDIDATES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8)
-REGIMES: tuple[Regime, ...] = ("orthogonal", "thin")
+REGIMES: tuple[Regime, ...] = ("orthogonal", "thin", "thick")
 #: Voxels this close to the true surface are scored (mm).
 BAND_MM = 5.0
 
@@ -79,9 +81,13 @@ def with_precision(model: ShapeModel, precision: float) -> ShapeModel:
 def score(model: ShapeModel, case: Case, regime: Regime) -> float:
     """Cross-entropy (nats a voxel) of the posterior mean occupancy near the true surface."""
     drawing = for_evaluation(case.mask, case.grid, regime)
-    found = reconstruct(model, [drawing.stack], Options(annotated=drawing.planes, uncertainty="laplace"))
+    observations = observe([drawing.stack], drawing.planes, budget=OBSERVATION_BUDGET, seed=0)
+    found = fit(model, observations, FitOptions())
     near = near_surface(case.mask, case.grid.spacing)
-    probability = np.clip(occupancy(model, found.state, case.grid)[near].astype(float), 1e-6, 1.0 - 1e-6)
+    points = case.grid.to_world(np.argwhere(near).astype(float))
+    logits, by_parameter, _ = fitted_jacobians(model, found, points)
+    probability = mean_probability(logits, logit_variance(by_parameter, laplace_covariance(found)))
+    probability = np.clip(probability.astype(float), 1e-6, 1.0 - 1e-6)
     return float(-np.mean(np.where(case.mask[near], np.log(probability), np.log1p(-probability))))
 
 
