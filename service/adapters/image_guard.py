@@ -139,7 +139,7 @@ def inflated(file: BinaryIO, encoding: str, size: int, part: str) -> memoryview:
 
 def _decompressor(file: BinaryIO, encoding: str) -> Any:
     if encoding == "gzip":
-        return gzip.GzipFile(fileobj=file)
+        return gzip.GzipFile(fileobj=file, mode="rb")
     if encoding == "bzip2":
         return bz2.BZ2File(file)
     if encoding == "zlib":

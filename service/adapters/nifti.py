@@ -44,7 +44,7 @@ def nifti_head(file: BinaryIO) -> bytes:
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
     try:
-        return (gzip.GzipFile(fileobj=file).read(HEAD_SIZE) if zipped else file.read(HEAD_SIZE)) or b""
+        return (gzip.GzipFile(fileobj=file, mode="rb").read(HEAD_SIZE) if zipped else file.read(HEAD_SIZE)) or b""
     except (OSError, EOFError, zlib.error):
         return b""
 

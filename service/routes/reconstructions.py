@@ -104,7 +104,7 @@ def _read_stacks(
     stacks = []
     for number, mask in enumerate(form.mask):
         watch("masks")
-        stacks.append(services.read_mask(mask.file.read(), f"mask[{number}]", labels))
+        stacks.append(services.read_mask(mask.file, f"mask[{number}]", labels))
     return tuple(stacks)
 
 

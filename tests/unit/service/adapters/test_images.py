@@ -263,9 +263,10 @@ def test_written_nifti_reads_back(seed, flip, kind):
     np.testing.assert_array_equal(np.asanyarray(image.dataobj), values.astype(np.uint8) if kind is bool else values)
     assert image.get_data_dtype() == (np.float32 if kind is np.float32 else np.uint8)
     assert image.header.get_xyzt_units()[0] == "mm"
-    for affine, code in (image.get_sform(coded=True), image.get_qform(coded=True)):
+    # A qform holds three quaternion components in single precision: near half turns the fourth keeps half the digits.
+    for (affine, code), tolerance in ((image.get_sform(coded=True), 1e-4), (image.get_qform(coded=True), 1e-2)):
         assert code == 1
-        np.testing.assert_allclose(affine, grid.affine, atol=2e-3)
+        np.testing.assert_allclose(affine, grid.affine, atol=tolerance)
 
 
 def test_written_nifti_is_repeatable_and_has_its_description():
