@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from model.bundle import ShapeModel
+from model.errors import InvalidMask
 from model.geometry import POSE_SIZE, Pose
 from model.inference.observations import Observations
 
@@ -158,8 +159,17 @@ def fit(model: ShapeModel, observations: Observations, options: FitOptions) -> F
 
 
 def starting_poses(observations: Observations, options: FitOptions) -> Sequence[Pose]:
-    """Poses at the centroid of the drawn foreground, one for each side that may be tried."""
+    """Poses at the centroid of the drawn foreground, one for each side that may be tried.
+
+    Raises:
+        InvalidMask: no observation is foreground, as when thinning out many planes left none that holds any.
+    """
     inside = observations.weights * observations.labels
+    if not inside.any():
+        raise InvalidMask(
+            "mask holds no foreground on the planes that were sampled from it; fewer annotated planes are accepted",
+            part="mask",
+        )
     centre = inside @ observations.points / inside.sum()
     sides = {"never": (False,), "always": (True,), "auto": (False, True)}[options.mirror]
     return [Pose(position=centre, mirrored=side) for side in sides]

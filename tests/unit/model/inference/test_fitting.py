@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from model.errors import InvalidMask
 from model.geometry import POSE_SIZE, Pose
 from model.inference.fitting import (
     Fit,
@@ -246,6 +247,12 @@ def test_starts_at_the_centroid_of_the_drawing():
         assert [start.mirrored for start in starts] == sides
         for start in starts:
             np.testing.assert_allclose(start.position, CENTRE, atol=0.05)
+
+
+def test_observations_without_foreground_are_refused():
+    observations = observations_of(Ellipsoid((12.0, 9.0, 7.0), CENTRE))
+    with pytest.raises(InvalidMask, match="no foreground"):
+        fit(MODEL, replace(observations, labels=np.zeros_like(observations.labels)), FitOptions())
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
