@@ -26,7 +26,10 @@ class ShapePoints:
 
 @dataclass(frozen=True)
 class Batch:
-    """Points drawn for some shapes; each shape's weights make its weighted sum estimate the mean over its band."""
+    """Points drawn for some shapes.
+
+    Each shape's weighted sum estimates the sum over all its points, divided by the number of its near ones.
+    """
 
     points: Float[Tensor, "b n 3"]
     labels: Float[Tensor, "b n"]
@@ -44,7 +47,8 @@ class PointPool:
     def draw(self, chosen: Int[Tensor, "b"], counts: tuple[int, int], generator: torch.Generator) -> Batch:
         """Draw ``counts`` (near, far) points of each chosen shape, with replacement."""
         parts = [s.draw(chosen, n, generator) for s, n in zip(self._strata, counts, strict=True)]
-        band = self._strata[0].count[chosen].clamp(min=1).float()
+        near, far = (s.count[chosen] for s in self._strata)
+        band = torch.where(near > 0, near, far).clamp(min=1).float()
         weights = [
             (s.count[chosen].float() / band / n)[:, None].expand(-1, n)
             for s, n in zip(self._strata, counts, strict=True)
@@ -59,8 +63,9 @@ class _Stratum:
         counts = np.array([c.sum() for c in chosen])
         self.count = torch.from_numpy(counts).to(device)
         self.start = torch.from_numpy(np.concatenate([[0], np.cumsum(counts)[:-1]])).to(device)
-        points = np.concatenate([s.points[c] for s, c in zip(shapes, chosen, strict=True)])
-        labels = np.concatenate([s.labels[c] for s, c in zip(shapes, chosen, strict=True)])
+        # One point behind the last: a shape without points in this stratum reads it, with weight 0.
+        points = np.concatenate([*(s.points[c] for s, c in zip(shapes, chosen, strict=True)), np.zeros((1, 3))])
+        labels = np.concatenate([*(s.labels[c] for s, c in zip(shapes, chosen, strict=True)), np.zeros(1, bool)])
         self.points = torch.from_numpy(points.astype(np.float32)).to(device)
         self.labels = torch.from_numpy(labels.astype(np.float32)).to(device)
 

@@ -11,6 +11,7 @@ Graphs (batch ``b`` and points ``n`` dynamic, float32):
 """
 
 import logging
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -172,6 +173,7 @@ def export_graphs(decoder: OccupancyDecoder, prior: LatentPrior, folder: Path) -
         written.append(f"{spec.name}.onnx")
         if spec.scripted is not None:
             torch.jit.save(_scripted(spec.scripted, spec, size, extent), folder / f"{spec.name}.pt")
+            _leave_out_source_places(folder / f"{spec.name}.pt")
             written.append(f"{spec.name}.pt")
         check_parity(spec, folder, size, extent)
     return written
@@ -201,6 +203,15 @@ def _scripted(module: nn.Module, spec: GraphSpec, size: int, extent: float) -> t
     example = spec.example(size, extent, batch=7, points=11, seed=0)
     traced: torch.jit.ScriptModule = torch.jit.trace(module, example, check_trace=False)
     return traced
+
+
+def _leave_out_source_places(path: Path) -> None:
+    """Rewrite a TorchScript archive without its debug records, which name folders of the exporting machine."""
+    with zipfile.ZipFile(path) as archive:
+        kept = {name: archive.read(name) for name in archive.namelist() if not name.endswith(".debug_pkl")}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in kept.items():
+            archive.writestr(zipfile.ZipInfo(name), content)
 
 
 def check_parity(spec: GraphSpec, folder: Path, size: int, extent: float) -> None:

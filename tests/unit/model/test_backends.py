@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from model.backends import Decoder, Prior, load_onnx, load_torchscript
+from model.bundle import open_bundle
 
 pytestmark = [
     pytest.mark.xdist_group("exported"),
@@ -103,3 +104,11 @@ def test_a_shape_does_not_depend_on_those_beside_it(backend):
     decoder, prior = backend
     close(decoder.logits(codes()[2:3], points()[2:3]), decoder.logits(codes(), points())[2:3], 1e-5)
     close(prior.from_base(codes()[2:3]), prior.from_base(codes())[2:3], 1e-5)
+
+
+def test_in_shipped_models_base_coordinates_lead_back_to_the_codes(shipped_bundles):
+    for folder in shipped_bundles:
+        model = open_bundle(folder, threads=1)
+        base = model.prior.to_base(model.population.codes)
+        close(base, model.population.base_codes, 1e-3)
+        close(model.prior.from_base(base), model.population.codes, 1e-3)

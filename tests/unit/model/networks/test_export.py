@@ -1,3 +1,4 @@
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -38,6 +39,16 @@ def test_every_graph_is_written_for_both_runtimes(exported):
     written = {path.name for path in exported.folder.iterdir()} - {"manifest.json", "population.npz"}
     scripted = {f"{name}.pt" for name in NAMES if name != "prior_base_jacobian"}
     assert written == {f"{name}.onnx" for name in NAMES} | scripted
+
+
+def test_no_file_tells_where_it_was_made(exported, repository):
+    for path in exported.folder.iterdir():
+        data = path.read_bytes()
+        if path.suffix == ".pt":
+            with zipfile.ZipFile(path) as archive:
+                data = b"".join(archive.read(name) for name in archive.namelist())
+        assert str(repository).encode() not in data, path.name
+        assert b"site-packages" not in data, path.name
 
 
 @pytest.mark.parametrize("name", NAMES)
