@@ -32,6 +32,8 @@ MirrorRule = Literal["auto", "never", "always"]
 
 #: Up to this damping a step is close to the Gauss-Newton step.
 FREE_DAMPING = 1.0
+#: Longest step of one iteration: of the code (prior SDs), of the position (mm) and of the rotation (rad).
+LONGEST_CODE_STEP, LONGEST_MOVE_MM, LONGEST_TURN = 4.0, 15.0, 0.35
 
 
 class FitStatus(StrEnum):
@@ -92,13 +94,14 @@ class Fit:
 
 @dataclass(frozen=True)
 class _Point:
-    """The objective at one place with its gradient and Fisher curvature over (latent, pose step)."""
+    """The objective at one place, its gradient and Fisher curvature over (latent, pose step), and the prior's SDs."""
 
     latent: Float[np.ndarray, "d"]
     pose: Pose
     value: float
     gradient: Float[np.ndarray, "p"]
     curvature: Float[np.ndarray, "p p"]
+    reach: Float[np.ndarray, "d"]
 
 
 class _Objective:
@@ -132,6 +135,7 @@ class _Objective:
             float(self._weights @ cross_entropy),
             (self._weights * (probability - self._labels)) @ jacobian,
             (jacobian * fisher[:, None]).T @ jacobian,
+            self._sigmas,
         )
         return self._with_priors(point)
 
@@ -198,7 +202,7 @@ def _descend(
     damping, growth = 1e-2, 2.0
     for iteration in range(options.max_iterations):
         step = _damped_step(point, damping)
-        expected = -0.5 * float(step @ point.gradient)
+        expected = -float(step @ point.gradient + 0.5 * step @ point.curvature @ step)
         if expected < options.tolerance:
             # Behind rejected steps a step is short by its damping, not because the optimum is near.
             return point, iteration, FitStatus.CONVERGED if damping <= FREE_DAMPING else FitStatus.STALLED
@@ -217,5 +221,12 @@ def _descend(
 
 
 def _damped_step(point: _Point, damping: float) -> Float[np.ndarray, "p"]:
+    """Solution of the damped normal equations, shortened so that the object moves and turns by a bounded step."""
     damped = point.curvature + damping * np.diag(np.diag(point.curvature))
-    return -cho_solve(cho_factor(damped), point.gradient)
+    step = -cho_solve(cho_factor(damped), point.gradient)
+    excess = max(
+        np.linalg.norm(step[:-POSE_SIZE] / point.reach) / LONGEST_CODE_STEP,
+        np.linalg.norm(step[-POSE_SIZE:-4]) / LONGEST_MOVE_MM,
+        np.linalg.norm(step[-4:-1]) / LONGEST_TURN,
+    )
+    return np.asarray(step / max(1.0, excess))

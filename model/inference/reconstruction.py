@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import expit
 
 from model.bundle import ShapeModel
-from model.errors import InvalidParameter
+from model.errors import InvalidMask, InvalidParameter
 from model.inference.ensemble import fit_ensemble
 from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
 from model.inference.mesh import Mesh
@@ -114,6 +114,12 @@ def reconstruct(
     found = fit(model, observations, FitOptions(mirror=options.mirror))
     watch("surface")
     mesh = surface_of(model, found.latent, found.pose, options.resolution_mm)
+    if mesh.is_empty:
+        raise InvalidMask(
+            f"The drawing has nothing in common with a {model.manifest.structure}, no shape of the model comes near it; "
+            "drawings of the model's own structure are accepted.",
+            part="mask",
+        )
     watch("uncertainty")
     state = _state(model, observations, found, options)
     factors = displacement_factors(model, state, mesh)
