@@ -116,7 +116,7 @@ def reconstruct(
     mesh = surface_of(model, found.latent, found.pose, options.resolution_mm)
     if mesh.is_empty:
         raise InvalidMask(
-            f"The drawing has nothing in common with a {model.manifest.structure}, no shape of the model comes near it; "
+            f"The drawing has nothing in common with a {model.manifest.structure}, no shape of it comes near; "
             "drawings of the model's own structure are accepted.",
             part="mask",
         )

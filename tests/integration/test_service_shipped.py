@@ -59,3 +59,33 @@ def test_a_real_hippocampus_comes_back_whole(shipped_bundles, shared_data, tmp_p
     assert '"converged": true' in capsys.readouterr().out
     found = np.asarray(nib.load(tmp_path / "d.nii.gz").dataobj) == 1
     assert dice(found, truth) > 0.75
+
+
+@pytest.fixture
+def femur_slices(shared_data):
+    """Three orthogonal slices of a real distal femur (NIfTI)."""
+    image = nib.load(sorted((shared_data / "femur" / "test").glob("*.nii.gz"))[0])
+    whole = np.asarray(image.dataobj) > 0
+    drawn = np.zeros(whole.shape, np.uint8)
+    for axis in range(3):
+        section = np.moveaxis(whole, axis, 0)
+        largest = int(section.sum(axis=(1, 2)).argmax())
+        np.moveaxis(drawn, axis, 0)[largest] = section[largest]
+    return nib.Nifti1Image(drawn, image.affine).to_bytes()
+
+
+def test_a_femur_sent_to_the_hippocampus_model_is_answered_and_flagged_over_http(client, femur_slices):
+    made = client.post("/v1/reconstructions", files=mask_parts(femur_slices), data={"model": "hippocampus"})
+    assert made.status_code == 201
+    assert made.json()["typicality_percentile"] < 1.0
+    assert any("unlike the population" in sentence for sentence in made.json()["warnings"])
+
+
+def test_a_femur_sent_to_the_hippocampus_model_is_answered_and_flagged_on_the_command_line(
+    femur_slices, tmp_path, capsys
+):
+    (tmp_path / "mask.nii").write_bytes(femur_slices)
+    words = ["reconstruct", tmp_path / "mask.nii", "--model", "hippocampus", "--output", tmp_path / "s.stl", "--json"]
+    assert main([str(word) for word in words]) == 0
+    assert "unlike the population" in capsys.readouterr().out
+    assert (tmp_path / "s.stl").stat().st_size > 1000
