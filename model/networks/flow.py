@@ -57,7 +57,7 @@ class SplineTransform(nn.Module):
         self.shape = shape
         order = torch.arange(shape.latent_size)
         order = order.flip(0) if reverse else order
-        hidden = torch.arange(shape.width) % max(1, shape.latent_size - 1)
+        hidden = torch.arange(shape.width) * max(1, shape.latent_size - 1) // shape.width
         outputs = order.repeat_interleave(splines.parameter_count(shape.bins))
         self.first = MaskedLinear((hidden[:, None] >= order[None, :]).float())
         self.second = MaskedLinear((hidden[:, None] >= hidden[None, :]).float())
