@@ -6,13 +6,14 @@ ONNX Runtime stands behind them by default, TorchScript when asked for. Batches 
 
 import os
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import onnxruntime
 from jaxtyping import Float
 
 
+@runtime_checkable
 class Decoder(Protocol):
     """Occupancy decoder ``f_theta(z, u)`` before its sigmoid, over canonical points (mm)."""
 
@@ -29,6 +30,7 @@ class Decoder(Protocol):
         ...
 
 
+@runtime_checkable
 class Prior(Protocol):
     """Density of latent codes: a normalizing flow onto a diagonal Gaussian."""
 

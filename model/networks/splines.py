@@ -59,15 +59,20 @@ def _take(table: Float[Tensor, "*s k1"], index: Tensor) -> Float[Tensor, "*s"]:
     return torch.gather(table, -1, index).squeeze(-1)
 
 
+def _bin_ends(knots: Knots, index: Tensor) -> tuple[Tensor, ...]:
+    """Positions, values and slopes at both ends of the chosen bins, and the chord's slope."""
+    x0, x1 = _take(knots.x, index), _take(knots.x, index + 1)
+    y0, y1 = _take(knots.y, index), _take(knots.y, index + 1)
+    d0, d1 = _take(knots.slope, index), _take(knots.slope, index + 1)
+    return x0, x1, y0, y1, d0, d1, (y1 - y0) / (x1 - x0)
+
+
 def forward(x: Float[Tensor, "*s"], knots: Knots, bound: float) -> tuple[Float[Tensor, "*s"], Float[Tensor, "*s"]]:
     """Spline value and log slope (equations 4 and 5)."""
     inside = (x > -bound) & (x < bound)
     safe = torch.where(inside, x, torch.zeros_like(x))
     index = _bin_of(safe, knots.x)
-    x0, x1 = _take(knots.x, index), _take(knots.x, index + 1)
-    y0, y1 = _take(knots.y, index), _take(knots.y, index + 1)
-    d0, d1 = _take(knots.slope, index), _take(knots.slope, index + 1)
-    chord = (y1 - y0) / (x1 - x0)
+    x0, x1, y0, y1, d0, d1, chord = _bin_ends(knots, index)
     t = (safe - x0) / (x1 - x0)
     y, log_slope = _evaluate(t, y0, y1 - y0, chord, d0, d1)
     return torch.where(inside, y, x), torch.where(inside, log_slope, torch.zeros_like(x))
@@ -86,10 +91,7 @@ def inverse(y: Float[Tensor, "*s"], knots: Knots, bound: float) -> Float[Tensor,
     inside = (y > -bound) & (y < bound)
     safe = torch.where(inside, y, torch.zeros_like(y))
     index = _bin_of(safe, knots.y)
-    x0, x1 = _take(knots.x, index), _take(knots.x, index + 1)
-    y0, y1 = _take(knots.y, index), _take(knots.y, index + 1)
-    d0, d1 = _take(knots.slope, index), _take(knots.slope, index + 1)
-    chord = (y1 - y0) / (x1 - x0)
+    x0, x1, y0, y1, d0, d1, chord = _bin_ends(knots, index)
     bend = (safe - y0) * (d0 + d1 - 2 * chord)
     a = (y1 - y0) * (chord - d0) + bend
     b = (y1 - y0) * d0 - bend
