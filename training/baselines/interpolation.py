@@ -1,4 +1,4 @@
-"""What can be had without a model: interpolation between drawn slices.
+"""Signed-distance interpolation between parallel slices.
 
 On the hippocampus test masks (axial slices centred in the object) the variants of what lies beyond the end
 slices differ by Dice and ASD: nothing 0.61 and 0.93 mm, the end slice for half a gap 0.60 and 1.05, the
@@ -6,16 +6,14 @@ receding distance used here 0.63 and 0.89; for thick slices 0.67 and 0.84, 0.67 
 """
 
 from collections.abc import Sequence
-from typing import Any
 
-import itk
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt
 
 from model.errors import InconsistentStacks, InvalidMask
 from model.geometry import COINCIDENCE_TOLERANCE_MM, Grid
 from model.inference.observations import MaskStack, Plane
+from training.baselines.distance import signed_distance
 
 
 def signed_distance_interpolation(stack: MaskStack, planes: Sequence[Plane], target: Grid) -> Bool[np.ndarray, "i j k"]:
@@ -38,30 +36,11 @@ def signed_distance_interpolation(stack: MaskStack, planes: Sequence[Plane], tar
     positions = _positions(stack, axis, indices, target)
     spacing = np.delete(target.spacing, axis)
     sections = [np.take(stack.foreground, index, axis) for index in indices]
-    distances = np.stack([_signed_distance(section, spacing) for section in sections])
+    distances = np.stack([signed_distance(section, spacing) for section in sections])
     slices = np.arange(target.shape[axis], dtype=float)
     beyond = np.maximum(np.maximum(positions[0] - slices, slices - positions[-1]), 0.0) * target.spacing[axis]
     between = _interpolated(distances, positions, slices)
     return np.moveaxis(between > beyond[:, None, None], 0, axis)
-
-
-def itk_contour_interpolation(drawn: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
-    """Morphological contour interpolation (Zukic et al., Insight Journal, 2016) by ITK.
-
-    Takes parallel slices as well as slices along several axes in one mask; ITK finds the axes itself.
-    It fills between slices of one axis only: from a single slice along each axis it returns the drawing.
-
-    Args:
-        drawn: foreground of the drawn planes, background everywhere else.
-    """
-    toolkit: Any = itk
-    image = toolkit.image_from_array(np.ascontiguousarray(drawn.transpose(2, 1, 0), np.uint8))
-    interpolator = toolkit.MorphologicalContourInterpolator[type(image)].New(Input=image)
-    # With more than one thread the filter (2.1.2) corrupts the heap and the process often aborts.
-    interpolator.SetNumberOfWorkUnits(1)
-    interpolator.GetMultiThreader().SetMaximumNumberOfThreads(1)
-    interpolator.Update()
-    return np.asarray(toolkit.array_from_image(interpolator.GetOutput()).transpose(2, 1, 0) > 0)
 
 
 def _parallel(stack: MaskStack, planes: Sequence[Plane]) -> tuple[int, list[int]]:
@@ -97,14 +76,3 @@ def _interpolated(
     after = np.minimum(before + 1, len(positions) - 1)
     share = (place - before)[:, None, None]
     return np.asarray((1.0 - share) * distances[before] + share * distances[after])
-
-
-def _signed_distance(section: Bool[np.ndarray, "a b"], spacing: Float[np.ndarray, "2"]) -> Float[np.ndarray, "a b"]:
-    """Distance to the border between the voxels (mm), positive inside; an empty section is far outside."""
-    if not section.any():
-        return np.full(section.shape, -float(np.hypot(*(np.array(section.shape) * spacing))))
-    padded = np.pad(section, 1)
-    inside = distance_transform_edt(padded, spacing)[1:-1, 1:-1]
-    outside = distance_transform_edt(~section, spacing)
-    half = spacing.min() / 2.0
-    return np.asarray(np.where(section, inside - half, half - outside))
