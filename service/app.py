@@ -13,7 +13,7 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 from fastapi_offline import FastAPIOffline
 
-from service.adapters.images import ImageLimits, read_mask, write_nifti
+from service.adapters.images import ImageLimits, read_masks, write_nifti
 from service.adapters.mesh_formats import write_mesh
 from service.adapters.result_store import DiskResultStore
 from service.adapters.workers import WorkerPool
@@ -92,7 +92,7 @@ def interface_document() -> dict[str, Any]:
 def mask_reader(settings: Settings) -> MaskReader:
     """The reader of masks with the limits of the settings."""
     limits = ImageLimits(max_bytes=settings.max_body_bytes, max_voxels=settings.max_voxels)
-    return lambda data, part, labels: read_mask(data, part, limits, labels)
+    return lambda data, part, labels: read_masks(data, part, limits, labels)
 
 
 def program_version() -> str:

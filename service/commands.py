@@ -124,7 +124,7 @@ def _read(settings: Settings, masks: list[Path], labels: frozenset[int] | None) 
             raise InvalidParameter(
                 f"mask[{number}] must be a file; there is none of this name.", part=f"mask[{number}]"
             )
-    return tuple(read(path, f"mask[{number}]", labels) for number, path in enumerate(masks))
+    return tuple(stack for number, path in enumerate(masks) for stack in read(path, f"mask[{number}]", labels))
 
 
 def _write_mesh(outcome: Outcome, path: Path | None, format: str) -> None:

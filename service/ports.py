@@ -123,9 +123,9 @@ class ResultStore(Protocol):
 
 
 class MaskReader(Protocol):
-    """One file to a mask stack."""
+    """One file to its mask stacks."""
 
-    def __call__(self, data: MaskSource, part: str, labels: frozenset[int] | None) -> MaskStack:
+    def __call__(self, data: MaskSource, part: str, labels: frozenset[int] | None) -> tuple[MaskStack, ...]:
         """Foreground are the voxels with one of the labels, all non-zero ones when None."""
         ...
 

@@ -26,8 +26,8 @@ class ReconstructionForm(_Closed):
 
     mask: list[UploadFile] = Field(
         min_length=1,
-        description="sparse segmentation (NIfTI, NRRD, seg.nrrd or MetaImage); several files are several stacks of "
-        "the same object, each with its own grid; the first one's grid is the input's grid",
+        description="sparse segmentation (NIfTI, NRRD, seg.nrrd, MetaImage, DICOM SEG or RTSTRUCT); several files are "
+        "several stacks of the same object, each with its own grid; the first one's grid is the input's grid",
     )
     model: str | None = Field(None, description="model name; may be left out when only one is loaded")
     label: list[str] = Field(

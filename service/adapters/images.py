@@ -1,11 +1,13 @@
 """Mask images that clients send, and label maps and probabilities that they get.
 
-NIfTI, NRRD (3-D Slicer's segmentations too) and MetaImage are told apart by their content, never by a
-file name. Sizes are checked from the header before anything of that size is in memory. World
+NIfTI, NRRD (3-D Slicer's segmentations too), MetaImage and DICOM are told apart by their content, never by
+a file name. Sizes are checked from the header before anything of that size is in memory. World
 coordinates are RAS in mm. The voxels are read here from checked headers, in bounded memory, so no
 native parser meets what a stranger sent.
 """
 
+from collections.abc import Callable
+from importlib import import_module
 from typing import BinaryIO, Literal
 
 import numpy as np
@@ -18,9 +20,25 @@ from service.adapters.metaimage import is_metaimage, read_metaimage
 from service.adapters.nifti import is_nifti, nifti_head, read_nifti, write_nifti
 from service.adapters.nrrd_format import is_nrrd, read_nrrd
 
-__all__ = ["ImageFormat", "ImageLimits", "Source", "image_format", "read_mask", "write_nifti"]
+__all__ = ["ImageFormat", "ImageLimits", "Source", "image_format", "read_mask", "read_masks", "write_nifti"]
 
-ImageFormat = Literal["nifti", "nrrd", "metaimage"]
+#: Where a DICOM file says that it is one (PS3.10, 7.1).
+DICOM_PREFIX = slice(128, 132)
+
+ImageFormat = Literal["nifti", "nrrd", "metaimage", "dicom"]
+
+
+def read_masks(
+    source: Source, part: str, limits: ImageLimits, labels: frozenset[int] | None = None
+) -> tuple[MaskStack, ...]:
+    """The mask stacks of one file: one of an image, one for each direction of planes of a DICOM object.
+
+    Arguments and errors are those of `read_mask`; `UnreadableImage` also when DICOM is not installed.
+    """
+    with opened(source, part, limits) as file:
+        if image_format(file) == "dicom":
+            return _dicom_reader(part)(file, part, limits, labels)
+        return (read_mask(file, part, limits, labels),)
 
 
 def read_mask(source: Source, part: str, limits: ImageLimits, labels: frozenset[int] | None = None) -> MaskStack:
@@ -51,6 +69,8 @@ def image_format(file: BinaryIO) -> ImageFormat | None:
         return "nrrd"
     if is_metaimage(head):
         return "metaimage"
+    if head[DICOM_PREFIX] == b"DICM":
+        return "dicom"
     known = is_nifti(nifti_head(file))
     file.seek(0)
     return "nifti" if known else None
@@ -65,5 +85,17 @@ def _read(file: BinaryIO, part: str, limits: ImageLimits, *, labels_named: bool)
     if found == "metaimage":
         return read_metaimage(file, part, limits)
     raise UnreadableImage(
-        f"{part} is not a readable image; NIfTI, NRRD and MetaImage in a single file are accepted", part=part
+        f"{part} is not a readable image; NIfTI, NRRD, MetaImage, DICOM SEG and RTSTRUCT in a single file are accepted",
+        part=part,
     )
+
+
+def _dicom_reader(part: str) -> Callable[..., tuple[MaskStack, ...]]:
+    """The reader of DICOM objects, which the extra ``pacs`` brings."""
+    try:
+        reader: Callable[..., tuple[MaskStack, ...]] = import_module("service.adapters.dicom.masks").read_dicom_mask
+    except ImportError:
+        raise UnreadableImage(
+            f"{part} is a DICOM object, which needs the extra pacs; NIfTI, NRRD and MetaImage are accepted", part=part
+        ) from None
+    return reader

@@ -101,10 +101,10 @@ def _reconstruct(services: Services, form: ReconstructionForm, watch: Watch) -> 
 def _read_stacks(
     services: Services, form: ReconstructionForm, labels: frozenset[int] | None, watch: Watch
 ) -> tuple[MaskStack, ...]:
-    stacks = []
+    stacks: list[MaskStack] = []
     for number, mask in enumerate(form.mask):
         watch("masks")
-        stacks.append(services.read_mask(mask.file, f"mask[{number}]", labels))
+        stacks += services.read_mask(mask.file, f"mask[{number}]", labels)
     return tuple(stacks)
 
 

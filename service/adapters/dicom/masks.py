@@ -1,0 +1,53 @@
+"""Drawn objects of DICOM, by their class: segmentations and structure sets."""
+
+from typing import BinaryIO
+
+from pydicom import Dataset
+from pydicom.uid import RTStructureSetStorage
+
+from model.errors import UnreadableImage
+from model.geometry import Grid
+from model.inference.mask_stack import MaskStack
+from service.adapters.dicom.objects import read_object, tolerant
+from service.adapters.dicom.segmentations import SEGMENTATIONS, read_segmentation
+from service.adapters.dicom.structure_sets import read_structure_set
+from service.adapters.image_guard import ImageLimits
+
+#: SOP classes of drawings that are read.
+DRAWINGS = (*SEGMENTATIONS, RTStructureSetStorage)
+
+
+def read_dicom_mask(
+    file: BinaryIO, part: str, limits: ImageLimits, labels: frozenset[int] | None = None
+) -> tuple[MaskStack, ...]:
+    """The mask stacks of one file of checked length; errors as in `stacks_of_object`."""
+    return stacks_of_object(read_object(file, part), part, limits, labels)
+
+
+def stacks_of_object(
+    found: Dataset,
+    part: str,
+    limits: ImageLimits,
+    labels: frozenset[int] | None = None,
+    home: Grid | None = None,
+) -> tuple[MaskStack, ...]:
+    """One mask stack for each direction of planes that the object draws on, world RAS mm.
+
+    Args:
+        labels: numbers of segments or regions; all when None.
+        home: grid of the images that were drawn on, if they are at hand; drawings on them lie on it.
+
+    Raises:
+        UnreadableImage: neither SEG nor RTSTRUCT, or damaged.
+        InvalidMask, InvalidGeometry, InvalidParameter, TooLarge: as the readers say.
+    """
+    with tolerant(part):
+        kind = found.get("SOPClassUID")
+    if kind in SEGMENTATIONS:
+        return read_segmentation(found, part, limits, labels, home)
+    if kind == RTStructureSetStorage:
+        return read_structure_set(found, part, limits, labels, home)
+    raise UnreadableImage(
+        f"{part} is a DICOM object of another kind; segmentations (SEG) and structure sets (RTSTRUCT) are accepted",
+        part=part,
+    )

@@ -1,0 +1,129 @@
+"""Segmentation objects to mask stacks (PS3.3, A.51): binary, fractional and label map.
+
+Frames that lie in parallel become one stack; a segmentation of planes in several directions becomes
+several stacks. A label is a segment number. Planes without a frame were not looked at.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Shaped
+from pydicom import Dataset
+from pydicom.uid import UID, SegmentationStorage
+
+from model.errors import InvalidMask, TooLarge
+from model.geometry import Grid
+from model.inference.mask_stack import MaskStack
+from model.inference.plane_cover import cover_planes
+from model.inference.stacks import EXCLUDED_VALUE, checked_labels, make_stack
+from service.adapters.dicom.objects import checked_frames, frames_of, tolerant
+from service.adapters.dicom.planes import at_home, frame_planes, parallel_groups, stack_grid
+from service.adapters.image_guard import ImageLimits
+
+#: SOP classes that are read here.
+SEGMENTATIONS = (SegmentationStorage, UID("1.2.840.10008.5.1.4.1.1.66.7"))
+#: Share of the largest value from which a voxel of a fractional segmentation belongs to the object.
+OCCUPIED = 0.5
+
+
+def read_segmentation(
+    found: Dataset,
+    part: str,
+    limits: ImageLimits,
+    labels: frozenset[int] | None = None,
+    home: Grid | None = None,
+) -> tuple[MaskStack, ...]:
+    """The stacks of the object that the segments draw.
+
+    Args:
+        labels: segment numbers of the object; all segments when None.
+        home: grid of the images that were drawn on; frames on them become planes of it.
+
+    Raises:
+        UnreadableImage, InvalidGeometry: damaged, or planes that are none.
+        InvalidMask: nothing drawn, or no such segment.
+        TooLarge: over a limit.
+    """
+    checked_labels(labels)
+    count, rows, columns = checked_frames(found, part, limits)
+    planes = frame_planes(found, part)
+    if len(planes) != count:
+        raise InvalidMask(f"{part} places {len(planes)} of its {count} frames; a place for each is needed", part=part)
+    groups = parallel_groups(planes)
+    own = [stack_grid([planes[number] for number in group], columns, rows) for group in groups]
+    grids = [at_home(*grid, home) for grid in own]
+    require_room([grid for grid, _ in grids], part, limits)
+    seat = {
+        frame: (g, place)
+        for g, group in enumerate(groups)
+        for frame, place in zip(group, grids[g][1].tolist(), strict=True)
+    }
+    volumes = [np.zeros(grid.shape, bool) for grid, _ in grids]
+    for frame, drawn in enumerate(_drawings(found, part, labels)):
+        group, place = seat[frame]
+        volumes[group][:, :, place] |= drawn.T
+    framed = [np.unique(places) for _, places in grids]
+    return stacks_of(part, [grid for grid, _ in grids], volumes, framed)
+
+
+def require_room(grids: Iterable[Grid], part: str, limits: ImageLimits) -> None:
+    """Refuse stacks that together have more voxels than allowed: `TooLarge`."""
+    if sum(float(np.prod([float(n) for n in grid.shape])) for grid in grids) > limits.max_voxels:
+        raise TooLarge(f"{part} spans more than {limits.max_voxels} voxels, the most that is accepted", part=part)
+
+
+def stacks_of(
+    part: str,
+    grids: Sequence[Grid],
+    volumes: Sequence[Bool[np.ndarray, "i j k"]],
+    drawn: Sequence[Shaped[np.ndarray, "n"]],
+) -> tuple[MaskStack, ...]:
+    """Checked stacks of those volumes that hold foreground.
+
+    Where a drawing lies in planes of its stack, the others count as never looked at. A drawing across them, on
+    planes along other axes, is left as it is.
+
+    Raises:
+        InvalidMask: nothing drawn at all.
+    """
+    kept = [(g, v, d) for g, v, d in zip(grids, volumes, drawn, strict=True) if v.any()]
+    if not kept:
+        raise InvalidMask(f"{part} draws nothing; an object with at least one voxel of it is accepted", part=part)
+    return tuple(make_stack(part, _values(volume, planes), grid.affine) for grid, volume, planes in kept)
+
+
+def _values(volume: Bool[np.ndarray, "i j k"], drawn: Shaped[np.ndarray, "n"]) -> Shaped[np.ndarray, "i j k"]:
+    values = volume.astype(np.uint8)
+    if all(axis == 2 for axis, _ in cover_planes(volume)):
+        values[:, :, np.setdiff1d(np.arange(volume.shape[2]), drawn)] = EXCLUDED_VALUE
+    return values
+
+
+def _drawings(found: Dataset, part: str, labels: frozenset[int] | None) -> Iterator[Bool[np.ndarray, "rows columns"]]:
+    """Which pixels of each frame are of the object."""
+    with tolerant(part):
+        kind, most = str(found.SegmentationType), float(found.get("MaximumFractionalValue") or 1)
+        numbers = [int(segment.SegmentNumber) for segment in found.SegmentSequence]
+        segments = [None] * len(numbers) if kind == "LABELMAP" else _segments_of_frames(found)
+        background = int(found.get("PixelPaddingValue") or 0)
+    wanted = {number for number in numbers if number != background or kind != "LABELMAP"}
+    if labels is not None and wanted.isdisjoint(labels):
+        listed = ", ".join(map(str, sorted(wanted)[:12])) or "none"
+        raise InvalidMask(f"{part} has no such segment; segments that are there: {listed}", part=part)
+    wanted &= labels or wanted
+    for number, frame in enumerate(frames_of(found, part)):
+        if kind == "LABELMAP":
+            yield np.isin(frame, sorted(wanted))
+        elif kind == "FRACTIONAL":
+            yield (frame >= OCCUPIED * most) & (segments[number] in wanted)
+        else:
+            yield (frame != 0) & (segments[number] in wanted)
+
+
+def _segments_of_frames(found: Dataset) -> list[int | None]:
+    shared = (found.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
+    name = "SegmentIdentificationSequence"
+    return [
+        int((frame if name in frame else shared)[name][0].ReferencedSegmentNumber)
+        for frame in found.PerFrameFunctionalGroupsSequence
+    ]
