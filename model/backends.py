@@ -12,6 +12,8 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float
 
+from model.chunks import Array, Network, Workers
+
 
 @runtime_checkable
 class Decoder(Protocol):
@@ -56,22 +58,23 @@ class Prior(Protocol):
 
 
 class OnnxDecoder:
-    """A bundle's decoder on ONNX Runtime."""
+    """A bundle's decoder on ONNX Runtime: single-threaded graphs over pieces of the points, `threads` at a time."""
 
     def __init__(self, folder: Path, latent_size: int, threads: int | None) -> None:
         self.latent_size = latent_size
-        self._logits = _session(folder / "decoder_logits.onnx", threads)
-        self._jacobians = _session(folder / "decoder_jacobians.onnx", threads)
+        self._workers = Workers(threads or os.cpu_count() or 1)
+        self._logits = _network(_session(folder / "decoder_logits.onnx", 1))
+        self._jacobians = _network(_session(folder / "decoder_jacobians.onnx", 1))
 
     def logits(self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n"]:
         """See `Decoder`."""
-        return _run(self._logits, latent=latent, points=points)[0]
+        return self._workers.evaluate(self._logits, latent, points)[0]
 
     def logits_and_jacobians(
         self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]
     ) -> tuple[Float[np.ndarray, "b n"], Float[np.ndarray, "b n d"], Float[np.ndarray, "b n 3"]]:
         """See `Decoder`."""
-        logits, by_latent, by_point = _run(self._jacobians, latent=latent, points=points)
+        logits, by_latent, by_point = self._workers.evaluate(self._jacobians, latent, points)
         return logits, by_latent, by_point
 
 
@@ -144,6 +147,15 @@ def _session(path: Path, threads: int | None) -> onnxruntime.InferenceSession:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def _network(session: onnxruntime.InferenceSession) -> Network:
+    """A decoder's graph as a function of arrays."""
+
+    def network(latent: Array, points: Array) -> list[Array]:
+        return _run(session, latent=latent, points=points)
+
+    return network
 
 
 def _run(session: onnxruntime.InferenceSession, **feeds: Float[np.ndarray, "..."]) -> list[Float[np.ndarray, "..."]]:
