@@ -9,8 +9,10 @@
         ├── Unauthorised           no key, or a wrong one
         ├── NotAcceptable          none of the accepted media types can be made
         ├── UnsupportedMediaType   the body's media type is not read
-        └── Abandoned              the client went away while its work was done
+        ├── Abandoned              the client went away while its work was done
+        └── Cancelled              nobody wants the job any more
     NotFound
+    ├── UnknownJob                 never enqueued, or expired
     ├── UnknownResult              never kept, expired or deleted
     └── NotComputed                a part of a result that was not asked for when it was made
 """
@@ -65,6 +67,14 @@ class Abandoned(ServiceError):
     """The client went away while its work was done."""
 
 
+class Cancelled(ServiceError):
+    """Nobody wants the job any more."""
+
+
+class UnknownJob(NotFound):
+    """Never enqueued, or expired."""
+
+
 class UnknownResult(NotFound):
     """Never kept, expired or deleted."""
 
@@ -99,6 +109,7 @@ KINDS: dict[type[MorphoFlowError], Kind] = {
     NotFound: Kind(404, "not-found", "Not found"),
     UnknownModel: Kind(404, "unknown-model", "Unknown model"),
     UnknownResult: Kind(404, "unknown-result", "Unknown result"),
+    UnknownJob: Kind(404, "unknown-job", "Unknown job"),
     NotComputed: Kind(404, "not-computed", "Not part of this result"),
     Overloaded: Kind(503, "overloaded", "Too much work is waiting"),
     StoreFull: Kind(507, "store-full", "No room for the result"),
@@ -106,6 +117,7 @@ KINDS: dict[type[MorphoFlowError], Kind] = {
     NotAcceptable: Kind(406, "not-acceptable", "No acceptable media type"),
     UnsupportedMediaType: Kind(415, "unsupported-media-type", "Media type not supported"),
     Abandoned: Kind(499, "abandoned", "The client went away"),
+    Cancelled: Kind(409, "cancelled", "The job was cancelled"),
     BundleError: Kind(500, "internal-error", "Internal error"),
     BundleIncomplete: Kind(500, "internal-error", "Internal error"),
     BundleCorrupt: Kind(500, "internal-error", "Internal error"),

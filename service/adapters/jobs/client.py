@@ -1,0 +1,157 @@
+"""Jobs as their callers see them: kept in a database, done by workers in other processes (`worker`)."""
+
+import threading
+import uuid
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from dbos import DBOSClient, WorkflowStatus, WorkflowStatusString
+
+from service.adapters.jobs.database import (
+    APPLICATION,
+    JOB,
+    JOBS_QUEUE,
+    RECORDS_VERSION,
+    SCHEMA,
+    Leases,
+    json_serializer,
+    prepare,
+)
+from service.errors import UnknownJob
+from service.job_ports import JobState, JobStatus, Record
+
+#: Event of a running job that holds its items: done and total.
+PROGRESS = "progress"
+_NAMESPACE = uuid.UUID("6d6f7270-686f-5f6c-8f77-6a6f62732d31")
+_STATES = {
+    WorkflowStatusString.DELAYED.value: JobState.QUEUED,
+    WorkflowStatusString.ENQUEUED.value: JobState.QUEUED,
+    WorkflowStatusString.PENDING.value: JobState.RUNNING,
+    WorkflowStatusString.SUCCESS.value: JobState.DONE,
+    WorkflowStatusString.CANCELLED.value: JobState.CANCELLED,
+}
+_FAULT = "The job met a fault of the service; its logs hold more under the job's identifier."
+
+
+class DbosJobs:
+    """The `JobEngine` over DBOS; connects when it is first used.
+
+    Args:
+        url: ``sqlite:////folder/file`` or ``postgresql://user@host/database``.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._lock = threading.Lock()
+        self._opened: tuple[DBOSClient, Leases] | None = None
+
+    def new_id(self, kind: str, key: str | None = None) -> str:
+        """Random, or the same for the same idempotency key."""
+        return str(uuid.uuid4() if key is None else uuid.uuid5(_NAMESPACE, f"{kind}\n{key}"))
+
+    def enqueue(self, kind: str, argument: Record, identifier: str) -> JobStatus:
+        """Have a job done; one that is there under the identifier is left as it is."""
+        self._client.enqueue(
+            {
+                "workflow_name": JOB,
+                "queue_name": JOBS_QUEUE,
+                "workflow_id": identifier,
+                "app_version": RECORDS_VERSION,
+            },
+            kind,
+            dict(argument),
+        )
+        return self.status(identifier)
+
+    def status(self, identifier: str) -> JobStatus:
+        """What is known of a job; `UnknownJob` when there is none."""
+        found = self._client.list_workflows(workflow_ids=[identifier], name=JOB)
+        if not found:
+            raise UnknownJob("There is no job of this identifier; it may have expired.")
+        progress = self._client.get_event(identifier, PROGRESS, 0) or {}
+        return job_status(found[0], progress)
+
+    def cancel(self, identifier: str) -> JobStatus:
+        """Stop a job with all of its parts."""
+        self.status(identifier)
+        self._client.cancel_workflow(identifier, cancel_children=True)
+        return self.status(identifier)
+
+    def is_wanted(self, identifier: str) -> bool:
+        """Whether a job is waiting or running."""
+        found = self._client.list_workflows(workflow_ids=[identifier], load_input=False, load_output=False)
+        return bool(found) and found[0].status in ("ENQUEUED", "PENDING", "DELAYED")
+
+    def forget(self, identifier: str) -> None:
+        """Remove the record of a job and its parts."""
+        self._client.delete_workflow(identifier, delete_children=True)
+
+    def ended_before(self, moment: datetime) -> Iterator[str]:
+        """Identifiers of the jobs that ended before a moment."""
+        found = self._client.list_workflows(
+            name=JOB, completed_before=moment.isoformat(), load_input=False, load_output=False
+        )
+        return (workflow.workflow_id for workflow in found)
+
+    def backlog(self) -> int:
+        """Parts that wait for a worker."""
+        return self._open()[1].waiting_parts()
+
+    def workers(self, lease_s: float) -> int:
+        """How many workers are alive."""
+        return self._open()[1].alive(lease_s)
+
+    def close(self) -> None:
+        """Let go of the database."""
+        with self._lock:
+            if self._opened is not None:
+                client, leases = self._opened
+                client.destroy()
+                leases.close()
+            self._opened = None
+
+    @property
+    def _client(self) -> DBOSClient:
+        return self._open()[0]
+
+    def _open(self) -> tuple[DBOSClient, Leases]:
+        with self._lock:
+            if self._opened is None:
+                serializer = json_serializer()
+                prepare(self._url)
+                client = DBOSClient(
+                    system_database_url=self._url,
+                    dbos_system_schema=SCHEMA,
+                    serializer=serializer,
+                    application_name=APPLICATION,
+                )
+                self._opened = client, Leases(self._url)
+            return self._opened
+
+
+def job_status(workflow: WorkflowStatus, progress: Mapping[str, Any]) -> JobStatus:
+    """A workflow's record as the status of a job."""
+    state = _STATES.get(workflow.status, JobState.FAILED)
+    if state is JobState.QUEUED and progress:
+        state = JobState.RUNNING  # waits for another worker to go on
+    answer = workflow.output if isinstance(workflow.output, dict) else {}
+    problem = answer.get("problem") if state is JobState.DONE else _FAULT if state is JobState.FAILED else None
+    kind, argument = workflow.input["args"] if workflow.input else ("", {})
+    return JobStatus(
+        id=workflow.workflow_id,
+        kind=kind,
+        state=JobState.FAILED if problem else state,
+        argument=argument,
+        created=_moment(workflow.created_at) or datetime.now(UTC),
+        started=_moment(progress.get("started_ms")),
+        finished=_moment(workflow.completed_at),
+        done=progress.get("done", 0),
+        total=progress.get("total", 0),
+        problem=problem,
+        result=answer.get("result"),
+    )
+
+
+def _moment(epoch_ms: int | None) -> datetime | None:
+    return None if epoch_ms is None else datetime.fromtimestamp(epoch_ms / 1000.0, UTC)

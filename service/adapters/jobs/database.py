@@ -1,0 +1,117 @@
+"""The jobs' database: SQLite for one machine, PostgreSQL for several; and which executors are alive.
+
+DBOS keeps jobs and their checkpoints in it. Beside its tables stands one of leases: every executor renews its own, and
+what one held whose lease has run out is taken over by another.
+"""
+
+import logging
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import sqlalchemy as sa
+from dbos import DBOS, DBOSPortableJSONSerializer
+from sqlalchemy.engine import make_url
+
+#: Of the application in DBOS's records.
+APPLICATION = "morphoflow"
+#: Of the records, not of the program: releases with the same one take over each other's jobs.
+RECORDS_VERSION = "jobs-1"
+#: Jobs wait in the first, the parts that they are made of in the second.
+JOBS_QUEUE, PARTS_QUEUE = "jobs", "parts"
+#: Names of the two workflows.
+JOB, PART = "job", "part"
+#: Schema of DBOS's tables on PostgreSQL.
+SCHEMA = "dbos"
+
+_LEASES = sa.Table(
+    "morphoflow_leases",
+    sa.MetaData(),
+    sa.Column("executor", sa.Text, primary_key=True),
+    sa.Column("seen_ms", sa.BigInteger, nullable=False),
+)
+_NOW_MS = {
+    "sqlite": "CAST((julianday('now') - 2440587.5) * 86400000 AS INTEGER)",
+    "postgresql": "CAST(extract(epoch FROM clock_timestamp()) * 1000 AS BIGINT)",
+}
+
+
+def json_serializer() -> DBOSPortableJSONSerializer:
+    """Records are JSON, so that reading one can run no code."""
+    logging.getLogger("dbos").setLevel(logging.CRITICAL)  # faults are logged by who meets them
+    return DBOSPortableJSONSerializer()
+
+
+def prepare(url: str) -> None:
+    """Make the database's file and tables, or bring them to this release's form."""
+    parsed = make_url(url)
+    if parsed.get_backend_name() == "sqlite" and parsed.database:
+        file = Path(parsed.database)
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with sqlite3.connect(file, timeout=30.0) as connection:
+            connection.execute("PRAGMA journal_mode=WAL")  # readers do not wait for writers; stays with the file
+        file.chmod(0o600)
+    DBOS.migrate(url, schema=SCHEMA)
+    engine = open_engine(url)
+    try:
+        _LEASES.create(engine, checkfirst=True)
+    except sa.exc.DBAPIError:  # another replica was faster
+        if not sa.inspect(engine).has_table(_LEASES.name):
+            raise
+    finally:
+        engine.dispose()
+
+
+def open_engine(url: str) -> sa.Engine:
+    """Connections of this project's own, beside those of DBOS."""
+    parsed = make_url(url)
+    if parsed.get_backend_name() == "sqlite":
+        return sa.create_engine(parsed, connect_args={"timeout": 30.0})
+    return sa.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_size=2, pool_pre_ping=True)
+
+
+class Leases:
+    """Which executors are alive, by the database's own clock."""
+
+    def __init__(self, url: str) -> None:
+        self._engine = open_engine(url)
+        self._now = sa.literal_column(_NOW_MS[self._engine.dialect.name], sa.BigInteger)
+
+    def renew(self, executor: str) -> None:
+        """This executor is alive."""
+        with self._engine.begin() as connection:
+            renewed = connection.execute(
+                sa.update(_LEASES).where(_LEASES.c.executor == executor).values(seen_ms=self._now)
+            )
+            if renewed.rowcount == 0:
+                connection.execute(sa.insert(_LEASES).values(executor=executor, seen_ms=self._now))
+
+    def lost(self, lease_s: float) -> Iterator[str]:
+        """Executors that have not been seen for so long."""
+        query = sa.select(_LEASES.c.executor).where(_LEASES.c.seen_ms < self._now - int(lease_s * 1000))
+        with self._engine.connect() as connection:
+            yield from connection.execute(query).scalars().all()
+
+    def alive(self, lease_s: float) -> int:
+        """How many executors have been seen since."""
+        query = sa.select(sa.func.count()).where(_LEASES.c.seen_ms >= self._now - int(lease_s * 1000))
+        with self._engine.connect() as connection:
+            return int(connection.execute(query).scalar_one())
+
+    def end(self, executor: str) -> None:
+        """This executor is gone and holds nothing."""
+        with self._engine.begin() as connection:
+            connection.execute(sa.delete(_LEASES).where(_LEASES.c.executor == executor))
+
+    def waiting_parts(self) -> int:
+        """Parts that no executor has begun."""
+        schema = None if self._engine.dialect.name == "sqlite" else SCHEMA
+        table = sa.table("workflow_status", sa.column("queue_name"), sa.column("status"), schema=schema)
+        query = sa.select(sa.func.count()).select_from(table)
+        query = query.where(table.c.queue_name == PARTS_QUEUE, table.c.status == "ENQUEUED")
+        with self._engine.connect() as connection:
+            return int(connection.execute(query).scalar_one())
+
+    def close(self) -> None:
+        """Let go of the connections."""
+        self._engine.dispose()

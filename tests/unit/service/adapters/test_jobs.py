@@ -1,0 +1,194 @@
+"""The engine of jobs on real databases: SQLite always, PostgreSQL where one listens on this machine."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+
+import psycopg
+import pytest
+
+from model.errors import InvalidMask
+from service.adapters.jobs.client import DbosJobs
+from service.adapters.jobs.database import Leases
+from service.adapters.jobs.worker import WorkerOptions, running_worker
+from service.errors import UnknownJob
+from service.job_ports import JobKind, JobState, JobStatus
+
+POSTGRES = os.environ.get("MORPHOFLOW_TEST_POSTGRES", "postgresql://postgres@127.0.0.1:5432")
+
+
+@pytest.fixture
+def sqlite_url(tmp_path):
+    return f"sqlite:///{tmp_path / 'jobs.sqlite'}"
+
+
+@pytest.fixture
+def postgres_url() -> Iterator[str]:
+    name = f"jobs_{uuid.uuid4().hex}"
+    try:
+        connection = psycopg.connect(f"{POSTGRES}/postgres", autocommit=True, connect_timeout=2)
+    except psycopg.OperationalError:
+        pytest.skip("no PostgreSQL on this machine (MORPHOFLOW_TEST_POSTGRES)")
+    connection.execute(f"CREATE DATABASE {name}")
+    yield f"{POSTGRES}/{name}"
+    connection.execute(f"DROP DATABASE {name} WITH (FORCE)")
+    connection.close()
+
+
+@pytest.fixture(params=["sqlite_url", "postgres_url"])
+def url(request) -> str:
+    return request.getfixturevalue(request.param)
+
+
+def squares(seen: list[int], fail: tuple[int, ...] = ()) -> JobKind:
+    def follow(run, argument):
+        run.expect(argument["count"])
+        answers = run.spread("square", [{"x": x} for x in range(argument["count"])])
+        return {"sum": sum(answer["y"] for answer in answers)}
+
+    def square(item, check):
+        check()
+        seen.append(item["x"])
+        if item["x"] in fail and seen.count(item["x"]) == 1:
+            raise OSError("The disk is full.")
+        return {"y": item["x"] ** 2}
+
+    return JobKind("squares", follow, {"square": square})
+
+
+def awaited(jobs: DbosJobs, identifier: str, wanted=lambda status: status.state.is_final) -> JobStatus:
+    limit = time.monotonic() + 60.0
+    while not wanted(status := jobs.status(identifier)) and time.monotonic() < limit:
+        time.sleep(0.05)
+    return status
+
+
+def test_a_job_is_done_in_parts_and_counted(url):
+    jobs, seen = DbosJobs(url), []
+    identifier = jobs.new_id("squares")
+    assert jobs.enqueue("squares", {"count": 7}, identifier).state is JobState.QUEUED
+    with running_worker([squares(seen)], WorkerOptions(url, "a-0")):
+        status = awaited(jobs, identifier)
+    assert (status.state, status.done, status.total, status.result) == (JobState.DONE, 7, 7, {"sum": 91})
+    assert sorted(seen) == list(range(7))
+    assert list(jobs.ended_before(datetime.now(UTC) + timedelta(minutes=1))) == [identifier]
+    jobs.forget(identifier)
+    with pytest.raises(UnknownJob):
+        jobs.status(identifier)
+    jobs.close()
+
+
+def test_the_same_key_is_the_same_job(sqlite_url):
+    jobs = DbosJobs(sqlite_url)
+    first, again = jobs.new_id("squares", "mine"), jobs.new_id("squares", "mine")
+    assert first == again != jobs.new_id("squares", "yours") != jobs.new_id("squares")
+    jobs.enqueue("squares", {"count": 3}, first)
+    assert jobs.enqueue("squares", {"count": 9}, again).argument == {"count": 3}
+    jobs.close()
+
+
+def test_a_failing_disk_is_tried_again_and_an_input_at_fault_is_told(sqlite_url):
+    def refuse(_item, _check):
+        raise InvalidMask("The mask has no foreground.", part="mask")
+
+    refusing = JobKind("refusing", lambda run, argument: {"all": run.spread("only", [{}])}, {"only": refuse})
+    jobs, seen = DbosJobs(sqlite_url), []
+    first, second = jobs.new_id("squares"), jobs.new_id("refusing")
+    jobs.enqueue("squares", {"count": 3}, first)
+    jobs.enqueue("refusing", {}, second)
+    with running_worker([squares(seen, fail=(1,)), refusing], WorkerOptions(sqlite_url, "a-0")):
+        assert awaited(jobs, first).result == {"sum": 5}
+        status = awaited(jobs, second)
+    assert seen.count(1) == 2
+    assert (status.state, status.problem) == (JobState.FAILED, "The mask has no foreground.")
+    jobs.close()
+
+
+def test_cancelling_stops_what_runs_and_what_waits(url):
+    entered, ended = threading.Event(), threading.Event()
+
+    def endless(_item, check):
+        entered.set()
+        try:
+            while True:
+                check()
+                time.sleep(0.01)
+        finally:
+            ended.set()
+
+    kind = JobKind("endless", lambda run, _: {"all": run.spread("part", [{}] * 5)}, {"part": endless})
+    jobs = DbosJobs(url)
+    identifier = jobs.new_id("endless")
+    jobs.enqueue("endless", {}, identifier)
+    with running_worker([kind], WorkerOptions(url, "a-0")):
+        assert entered.wait(30.0)
+        assert jobs.cancel(identifier).state is JobState.CANCELLED
+        assert ended.wait(30.0)
+        assert jobs.backlog() == 0
+    assert jobs.cancel(identifier).state is JobState.CANCELLED
+    jobs.close()
+
+
+def test_a_worker_that_stops_hands_back_what_it_has_not_done(sqlite_url):
+    jobs, seen = DbosJobs(sqlite_url), []
+    identifier = jobs.new_id("squares")
+    jobs.enqueue("squares", {"count": 40}, identifier)
+    with running_worker([squares(seen)], WorkerOptions(sqlite_url, "a-0")):
+        awaited(jobs, identifier, lambda status: status.done > 2)
+    assert len(seen) < 40
+    with running_worker([squares(seen)], WorkerOptions(sqlite_url, "b-0")):
+        assert awaited(jobs, identifier).state is JobState.DONE
+    assert sorted(seen) == list(range(40))
+    jobs.close()
+
+
+KILLED_WORKER = """
+import sys, time
+from service.adapters.jobs.worker import WorkerOptions, running_worker
+from service.job_ports import JobKind
+def square(item, check):
+    open(sys.argv[2] + "/" + str(item["x"]), "a").write("x")
+    time.sleep(0.05)
+    return {"y": item["x"] ** 2}
+def follow(run, argument):
+    run.expect(argument["count"])
+    return {"sum": sum(a["y"] for a in run.spread("square", [{"x": x} for x in range(argument["count"])]))}
+with running_worker([JobKind("squares", follow, {"square": square})], WorkerOptions(sys.argv[1], sys.argv[3], 2.0)):
+    time.sleep(120)
+"""
+
+
+@pytest.mark.parametrize("heir", ["gone-0", "other-0"], ids=["it comes back", "another takes over"])
+def test_a_killed_worker_loses_nothing(url, tmp_path, heir):
+    jobs, seen = DbosJobs(url), []
+    identifier = jobs.new_id("squares")
+    jobs.enqueue("squares", {"count": 30}, identifier)
+    command = [sys.executable, "-c", KILLED_WORKER, url, str(tmp_path), "gone-0"]
+    with subprocess.Popen(command) as killed:
+        awaited(jobs, identifier, lambda status: status.done > 3)
+        killed.kill()
+    with running_worker([squares(seen)], WorkerOptions(url, heir, lease_s=2.0)):
+        status = awaited(jobs, identifier)
+    assert status.result == {"sum": sum(x * x for x in range(30))}
+    before = [int(file.name) for file in tmp_path.iterdir() if file.name.isdigit()]
+    assert set(before) | set(seen) == set(range(30))
+    assert len(set(before) & set(seen)) <= 1
+    jobs.close()
+
+
+def test_leases_run_out(url):
+    leases = Leases(url)
+    with running_worker([], WorkerOptions(url, "a-0")):
+        leases.renew("b-0")
+        assert leases.alive(60.0) == 2
+        assert list(leases.lost(60.0)) == []
+        assert "b-0" in set(leases.lost(-1.0))
+        leases.end("b-0")
+        assert leases.alive(60.0) == 1
+    assert leases.alive(60.0) == 0
+    leases.close()
