@@ -21,7 +21,8 @@ from model.errors import InputError, UnknownModel
 from model.geometry import Grid
 from model.inference.reconstruction import Options, reconstruct
 from model.inference.uncertainty import occupancy
-from training.baselines import itk_contour_interpolation, signed_distance_interpolation
+from training.baselines.contours import contour_fill
+from training.baselines.interpolation import signed_distance_interpolation
 from training.cohorts.cohort import Case
 from training.metrics_masks import MaskAgreement, agreement
 from training.sparsify import Drawing, Regime, for_evaluation
@@ -150,29 +151,6 @@ def fills_of(model: ShapeModel, seed: int) -> dict[Method, Fill]:
         ),
         Method.ITK: contour_fill,
     }
-
-
-def contour_fill(drawing: Drawing, grid: Grid) -> Bool[np.ndarray, "i j k"]:
-    """ITK's interpolation on a grid with the same voxels within the slices.
-
-    Thick slices stand half-way between two slices of the grid, so that they are filled at half its step and every
-    second slice is the answer. Slices beyond the grid are left out.
-    """
-    if drawing.stack.grid.coincides_with(grid) or not drawing.planes:
-        return itk_contour_interpolation(drawing.stack.foreground)
-    axis = drawing.planes[0].axis
-    shape = list(grid.shape)
-    shape[axis] *= 2
-    drawn = np.zeros(shape, bool)
-    for plane in drawing.planes:
-        corner = np.zeros((1, 3))
-        corner[0, axis] = plane.index
-        place = round(2 * float(grid.to_index(drawing.stack.grid.to_world(corner))[0, axis]))
-        if 0 <= place < shape[axis]:
-            section = np.moveaxis(drawing.stack.foreground, axis, 0)[plane.index]
-            np.moveaxis(drawn, axis, 0)[place] = section
-    filled = np.moveaxis(itk_contour_interpolation(drawn), axis, 0)[::2]
-    return np.moveaxis(filled, 0, axis)
 
 
 def measure(case: Case, regime: Regime, drawing: Drawing, method: Method, fill: Fill) -> Measurement:

@@ -56,7 +56,7 @@ def section(case: Case, normal: Float[np.ndarray, "3"], offset_mm: float, part: 
     last = np.array(case.grid.shape) - 1.0
     within = ((index >= 0.0) & (index <= last)).all(axis=1).reshape(grid.shape)
     value = map_coordinates(case.mask.astype(np.float32), index.T, order=1, mode="nearest").reshape(grid.shape)
-    return MaskStack(part, grid, (value >= OCCUPIED) & within, ~within)
+    return MaskStack(part, grid, np.asarray((value >= OCCUPIED) & within), np.asarray(~within))
 
 
 def section_grid(around: Grid, normal: Float[np.ndarray, "3"], offset_mm: float) -> Grid:

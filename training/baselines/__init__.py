@@ -5,8 +5,3 @@
 - `distance_modes`, `distance_fit`, `distance_choice`: principal modes of signed-distance fields, fitted to any planes;
 - `predecessor`: the latent code of this project's decoder by 1200 steps of Adam (needs torch).
 """
-
-from training.baselines.contours import itk_contour_interpolation
-from training.baselines.interpolation import signed_distance_interpolation
-
-__all__ = ["itk_contour_interpolation", "signed_distance_interpolation"]

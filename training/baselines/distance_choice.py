@@ -4,9 +4,8 @@ The score is the mean over drawings of the mean average surface distance. Traini
 """
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,6 +14,7 @@ import numpy as np
 from training.baselines.distance_fit import FitSettings, filled, fit_modes
 from training.baselines.distance_learning import learn_modes
 from training.baselines.distance_modes import DistanceModes
+from training.baselines.kept_modes import ChosenModes, is_kept, write_chosen
 from training.cohorts.cohort import Case, Cohort
 from training.metrics_masks import agreement
 from training.oblique import SliceStacks, random_planes
@@ -23,33 +23,26 @@ from training.sparsify import for_evaluation
 T = TypeVar("T")
 
 #: Candidates, tried in this order, the other settings at their defaults or at what was chosen before.
-CLIPS_MM = (5.0, 10.0, 20.0)
-SHARES = (0.9, 0.95, 0.98, 0.99)
-PRECISIONS = (0.02, 0.05, 0.2, 0.5)
-WIDTHS_MM = (0.5, 1.0, 2.0)
+WIDTHS_MM = (0.25, 0.5, 1.0)
+PRECISIONS = (0.05, 0.2, 0.5)
+SHARES = (0.95, 0.98, 0.99)
+CLIPS_MM = (10.0, 5.0, 20.0)
 #: Validation cases that are scored, evenly spaced.
 SCORED_CASES = 6
 #: Raised when the way of learning or choosing changes, so that kept results are made anew.
 VERSION = 1
 
 
-@dataclass(frozen=True)
-class ChosenModes:
-    """Modes, reduced to those in use, and the settings of their fit."""
-
-    modes: DistanceModes
-    settings: FitSettings
-
-
 def choose(cohort: Cohort) -> ChosenModes:
     """Learn on the training cases and choose on the validation cases."""
     drawn = [(case, drawing) for case in spread(cohort.validation, SCORED_CASES) for drawing in drawings_of(case)]
-    settings = FitSettings()
-    modes = _best([learn_modes(cohort.train, clip) for clip in CLIPS_MM], lambda one: score(one, settings, drawn))
-    for name, candidates in (("share", SHARES), ("precision", PRECISIONS), ("width_mm", WIDTHS_MM)):
+    modes, settings = learn_modes(cohort.train, CLIPS_MM[0]), FitSettings()
+    for name, candidates in (("width_mm", WIDTHS_MM), ("precision", PRECISIONS), ("share", SHARES)):
         trials = [replace(settings, **{name: value}) for value in candidates]
         settings = _best(trials, lambda one: score(modes, one, drawn))
-    return ChosenModes(modes.reduced(settings.share), settings)
+    others = [learn_modes(cohort.train, clip) for clip in CLIPS_MM[1:]]
+    best = _best([modes, *others], lambda one: score(one, settings, drawn))
+    return ChosenModes(best.reduced(settings.share), settings)
 
 
 def score(modes: DistanceModes, settings: FitSettings, drawn: Sequence[tuple[Case, SliceStacks]]) -> float:
@@ -69,19 +62,15 @@ def drawings_of(case: Case) -> list[SliceStacks]:
     return [*singles, random_planes(case, 5)]
 
 
-def kept(cohort: Cohort, folder: Path) -> ChosenModes:
-    """`choose`, or what it found before in this folder on the same masks."""
-    path = folder / f"{cohort.name}-{digest_of(cohort)[:16]}.npz"
-    record = path.with_suffix(".json")
-    if path.is_file() and record.is_file():
-        return ChosenModes(DistanceModes.load(path), FitSettings(**json.loads(record.read_text(encoding="utf-8"))))
-    found = choose(cohort)
-    found.modes.save(path)
-    record.write_text(json.dumps(asdict(found.settings)) + "\n", encoding="utf-8")
-    return found
+def kept(cohort: Cohort, folder: Path) -> Path:
+    """Where the result of `choose` lies in a folder; made when it is not there yet for these masks."""
+    path = folder / f"{cohort.name}-{cohort_digest(cohort)[:16]}.npz"
+    if not is_kept(path):
+        write_chosen(choose(cohort), path)
+    return path
 
 
-def digest_of(cohort: Cohort) -> str:
+def cohort_digest(cohort: Cohort) -> str:
     """SHA-256 over what `choose` depends on."""
     found = hashlib.sha256(repr((VERSION, CLIPS_MM, SHARES, PRECISIONS, WIDTHS_MM, SCORED_CASES)).encode())
     for case in (*cohort.train, *cohort.validation):

@@ -24,7 +24,7 @@ BUDGET = 2500
 #: Prior standard deviations of position (mm) and rotation (rad).
 POSE_SDS = np.array([20.0, 20.0, 20.0, 0.15, 0.15, 0.15])
 #: Widths of the logistic function come down to the chosen one by these factors, with so many iterations each.
-WIDTH_FACTORS, ITERATIONS = (4.0, 2.0, 1.0), (6, 6, 25)
+WIDTH_FACTORS, ITERATIONS = (2.0, 1.0), (8, 30)
 #: A stage ends when the objective falls by less than this share of itself.
 LEAST_PROGRESS = 1e-5
 FIRST_DAMPING, DAMPING_DOWN, DAMPING_UP, MOST_DAMPING = 1e-2, 0.3, 5.0, 1e6
@@ -42,7 +42,7 @@ class FitSettings:
 
     share: float = 0.98
     precision: float = 0.2
-    width_mm: float = 1.0
+    width_mm: float = 0.5
 
 
 @dataclass(frozen=True)

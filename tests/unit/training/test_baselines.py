@@ -8,7 +8,8 @@ from model.errors import InconsistentStacks, InvalidMask
 from model.geometry import Grid
 from model.inference.observations import MaskStack, Plane
 from tests.analytic_shapes import Ellipsoid
-from training.baselines import itk_contour_interpolation, signed_distance_interpolation
+from training.baselines.contours import itk_contour_interpolation
+from training.baselines.interpolation import signed_distance_interpolation
 from training.metrics_masks import agreement, dice
 
 SPACING = np.array([1.0, 0.8, 0.9])

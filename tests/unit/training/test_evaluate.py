@@ -10,11 +10,11 @@ from model.errors import UnknownModel
 from model.geometry import Grid
 from tests.analytic_model import ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
+from training.baselines.contours import contour_fill
 from training.cohorts import Case
 from training.evaluate import (
     Measurement,
     Method,
-    contour_fill,
     evaluate,
     fills_of,
     find_bundle,

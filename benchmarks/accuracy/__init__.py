@@ -1,0 +1,1 @@
+"""Accuracy, time and memory of the project beside what it competes with; see `benchmarks.accuracy.command`."""
