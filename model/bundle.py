@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,6 +49,7 @@ class Manifest:
         licence, attribution: of the weights.
         accuracy: measured figures by regime, for example ``{"thin": {"dice": 0.87, "asd_mm": 0.34}}``.
         files: SHA-256 by file name.
+        anatomy: code of the structure, by default none: ``value``, ``scheme`` (``SCT`` for SNOMED CT) and ``meaning``.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Manifest:
     attribution: str
     accuracy: dict[str, dict[str, float]]
     files: dict[str, str]
+    anatomy: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,8 @@ def write_manifest(manifest: Manifest, folder: Path) -> None:
 
 def _manifest_of(values: dict[str, Any]) -> Manifest:
     known = {f.name for f in fields(Manifest)}
-    missing = sorted(known - values.keys())
+    needed = {f.name for f in fields(Manifest) if f.default_factory is MISSING}
+    missing = sorted(needed - values.keys())
     if missing:
         raise BundleCorrupt(f"{MANIFEST} lacks {', '.join(missing)}; one written by morphoflow export is accepted.")
     values = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items() if name in known}

@@ -55,11 +55,18 @@ def read_object(file: BinaryIO, part: str) -> Dataset:
 
 
 @contextmanager
+def quiet() -> Iterator[None]:
+    """No warnings about values: they hold them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+@contextmanager
 def tolerant(part: str) -> Iterator[None]:
     """Quiet about odd values; anything that a damaged object raises becomes `UnreadableImage`."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with quiet():
             yield
     except _FAULTS as error:
         raise UnreadableImage(f"{part} is a damaged DICOM object; a complete one is accepted", part=part) from error

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from pydicom.uid import DeflatedExplicitVRLittleEndian, RLELossless
 
-pytest.importorskip("highdicom", reason="the extra pacs is not installed")
-
 from model.errors import InputError, InvalidGeometry, InvalidMask, TooLarge, UnreadableImage
 from model.inference.observations import Plane, find_planes
 from service.adapters.dicom.masks import read_dicom_mask, stacks_of_object
