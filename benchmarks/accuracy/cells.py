@@ -35,6 +35,7 @@ class Cell:
         dice, asd_mm, hd95_mm, hd_mm: against the dense mask; NaN when the method refused the drawing.
         fit_s: from the drawing to the fitted parameters; all of ``seconds`` for methods without a fit.
         seconds: from the drawing to the dense mask.
+        cpu_s: processor time of ``seconds``, which other programs on the machine disturb less.
         peak_mib: largest resident memory of the method's process meanwhile, its libraries included.
         refusal: why there is no figure, empty otherwise.
     """
@@ -46,6 +47,7 @@ class Cell:
     hd_mm: float
     fit_s: float
     seconds: float
+    cpu_s: float
     peak_mib: float
     refusal: str = ""
 

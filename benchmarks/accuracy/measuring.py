@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from benchmarks.accuracy.cells import Cell, CellKey
 from benchmarks.accuracy.drawings import draw
 from benchmarks.accuracy.memory import with_peak
-from benchmarks.accuracy.methods import Fill, Filled, Sources, make_fill
+from benchmarks.accuracy.methods import Fill, Sources, make_fill
 from benchmarks.accuracy.names import MethodName
 from model.errors import InputError
 from training.cohorts.cohort import Case
@@ -52,21 +52,18 @@ def measure_all(tasks: Sequence[Task], jobs: int, watch: Callable[[Cell], None])
 def measure(key: CellKey, case: Case, fill: Fill) -> Cell:
     """One cell; a drawing that the method cannot take is an answer."""
     drawing = draw(case, key.drawing)
-    begin = time.perf_counter()
+    begin, cpu = time.perf_counter(), time.process_time()
     try:
         found, peak = with_peak(lambda: fill(drawing, case.grid))
     except InputError as error:
         nan = math.nan
-        return Cell(key, nan, nan, nan, nan, nan, time.perf_counter() - begin, nan, str(error))
-    seconds = time.perf_counter() - begin
-    return cell_of(key, case, found, seconds, peak)
-
-
-def cell_of(key: CellKey, case: Case, found: Filled, seconds: float, peak_mib: float) -> Cell:
-    """Figures of a dense mask."""
+        return Cell(key, nan, nan, nan, nan, nan, time.perf_counter() - begin, nan, nan, str(error))
+    seconds, cpu_s = time.perf_counter() - begin, time.process_time() - cpu
     figures = agreement(case.mask, found.mask, case.grid.spacing)
     fit_s = seconds if found.fit_s is None else found.fit_s
-    return Cell(key, figures.dice, figures.asd_mm, figures.hd95_mm, figures.hd_mm, fit_s, seconds, peak_mib)
+    return Cell(
+        key, figures.dice, figures.asd_mm, figures.hd95_mm, figures.hd_mm, fit_s, seconds, cpu_s, peak, refusal=""
+    )
 
 
 def _run(task: Task, cells: "queue.Queue[Cell]") -> None:

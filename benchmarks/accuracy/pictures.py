@@ -106,9 +106,9 @@ def reconstructed(model: ShapeModel, drawn: SliceStacks) -> Surface:
 def surface_error(case: Case, surface: Surface) -> Float[np.ndarray, "v"]:
     """Distance (mm) of each vertex to the surface of a dense mask, from its distance field."""
     room = 8
-    field = np.abs(signed_distance(np.pad(case.mask, room), case.grid.spacing))
+    field = signed_distance(np.pad(case.mask, room), case.grid.spacing)
     index = case.grid.to_index(surface.vertices) + room
-    return np.asarray(map_coordinates(field, index.T, order=1, mode="nearest"))
+    return np.asarray(np.abs(map_coordinates(field, index.T, order=1, mode="nearest")))
 
 
 def contours(drawn: SliceStacks) -> list[Float[np.ndarray, "n 3"]]:
@@ -147,4 +147,6 @@ def _show(axes: Any, surface: Surface, colours: Any) -> None:
     lengths = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
     light = 0.45 + 0.55 * np.abs(across / lengths @ (LIGHT / np.linalg.norm(LIGHT)))
     shaded = np.broadcast_to(np.asarray(colours), (len(corners), 3)) * light[:, None]
-    axes.add_collection3d(Poly3DCollection(corners, facecolors=np.clip(shaded, 0.0, 1.0), linewidths=0))
+    axes.add_collection3d(
+        Poly3DCollection(corners, facecolors=np.clip(shaded, 0.0, 1.0), linewidths=0, antialiased=False)
+    )

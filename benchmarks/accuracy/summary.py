@@ -12,7 +12,7 @@ from benchmarks.accuracy.cells import Cell
 from benchmarks.accuracy.drawings import DrawingName
 from benchmarks.accuracy.names import MethodName
 
-FIGURES = ("dice", "asd_mm", "hd95_mm", "hd_mm", "fit_s", "seconds", "peak_mib")
+FIGURES = ("dice", "asd_mm", "hd95_mm", "hd_mm", "fit_s", "seconds", "cpu_s", "peak_mib")
 
 
 @dataclass(frozen=True)
