@@ -1,7 +1,7 @@
 """The one place where the service is wired."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager, suppress
 from functools import partial
 from importlib.metadata import PackageNotFoundError
@@ -15,12 +15,12 @@ from fastapi_offline import FastAPIOffline
 
 from service.adapters.images import ImageLimits, read_masks, write_nifti
 from service.adapters.mesh_formats import write_mesh
-from service.adapters.result_store import DiskResultStore
 from service.adapters.workers import WorkerPool
 from service.model_registry import ModelRegistry, load_registry
 from service.observability import Log, Metrics, make_log
 from service.ports import MaskReader
 from service.routes.dependencies import Services
+from service.routes.jobs import jobs_router
 from service.routes.middleware import AccessMiddleware, BodyLimitMiddleware, KeyMiddleware
 from service.routes.models import models_router
 from service.routes.operations import operations_router
@@ -30,6 +30,7 @@ from service.routes.results import results_router
 from service.routes.samples import samples_router
 from service.schemas import Problem, SurfaceSd
 from service.settings import Settings
+from service.stores import open_blobs, open_jobs, open_results
 
 TITLE = "MorphoFlow"
 #: Of the interface, not of the program: the second figure rises with additions, the first with breaks.
@@ -49,9 +50,8 @@ def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log
         log: where log entries go; standard error when None.
     """
     engine = WorkerPool(settings.workers, settings.max_waiting)
-    store = DiskResultStore(
-        settings.results_folder, lifetime_s=settings.result_lifetime_s, max_bytes=settings.results_max_bytes
-    )
+    blobs, jobs = open_blobs(settings), open_jobs(settings)
+    store = open_results(settings, blobs)
     services = Services(
         settings=settings,
         registry=load_registry(settings) if registry is None else registry,
@@ -60,7 +60,9 @@ def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log
         read_mask=mask_reader(settings),
         write_mesh=write_mesh,
         write_volume=write_nifti,
-        metrics=Metrics(engine),
+        jobs=jobs,
+        blobs=blobs,
+        metrics=Metrics(engine, jobs),
         log=log or make_log(settings.log_level),
     )
     app = FastAPIOffline(
@@ -69,7 +71,7 @@ def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log
         title=TITLE,
         version=INTERFACE_VERSION,
         description=DESCRIPTION,
-        lifespan=partial(_lifespan, services=services, sweep=store.sweep, close=engine.close),
+        lifespan=partial(_lifespan, services=services, sweep=store.sweep, close=(engine.close, jobs.close)),
     )
     app.state.services = services
     _add_routes(app)
@@ -109,7 +111,14 @@ def operation_name(route: APIRoute) -> str:
 
 
 def _add_routes(app: FastAPI) -> None:
-    for router in (reconstructions_router, results_router, models_router, samples_router, operations_router):
+    for router in (
+        reconstructions_router,
+        results_router,
+        models_router,
+        samples_router,
+        jobs_router,
+        operations_router,
+    ):
         app.include_router(router())
     app.openapi = partial(describe, app)  # type: ignore[method-assign]
 
@@ -143,7 +152,7 @@ def _drop_foreign_errors(document: dict[str, Any]) -> None:
 
 @asynccontextmanager
 async def _lifespan(
-    _: FastAPI, *, services: Services, sweep: Callable[[], int], close: Callable[[], None]
+    _: FastAPI, *, services: Services, sweep: Callable[[], int], close: Iterable[Callable[[], None]]
 ) -> AsyncIterator[None]:
     for broken in services.registry.broken:
         services.log.error("broken model", model=broken.name, reason=broken.reason)
@@ -155,7 +164,8 @@ async def _lifespan(
         sweeper.cancel()
         with suppress(asyncio.CancelledError):
             await sweeper
-        close()
+        for end in close:
+            end()
         services.log.info("stopped")
 
 
@@ -168,4 +178,6 @@ async def _sweep_for_ever(sweep: Callable[[], int], services: Services) -> None:
         else:
             if removed:
                 services.log.info("expired results removed", count=removed)
+        if await asyncio.to_thread(services.registry.refresh):
+            services.log.info("models reloaded", models=services.registry.names())
         await asyncio.sleep(services.settings.sweep_interval_s)

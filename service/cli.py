@@ -16,6 +16,8 @@ import yaml
 from model.errors import CohortError, InputError, MorphoFlowError, NotFound
 from service.app import create_app, interface_document, program_version
 from service.commands import OpenRegistry, models, reconstruct, sample
+from service.job_commands import jobs_commands
+from service.jobs.worker import run_worker, supervised_workers
 from service.model_registry import load_registry
 from service.observability import uvicorn_logging
 from service.settings import Settings, load_settings, require_protection
@@ -64,8 +66,9 @@ def build_app() -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback(invoke_without_command=True)(_program)
-    for command in (serve, reconstruct, sample, models, openapi):
+    for command in (serve, worker, reconstruct, sample, models, openapi):
         app.command()(command)
+    app.add_typer(jobs_commands(), name="jobs")
     return app
 
 
@@ -99,16 +102,28 @@ def serve(
     require_protection(settings)
     app = create_app(settings, registry=context.obj(settings))
     typer.echo(f"Try it from another terminal:\n\n  {example_request(settings)}\n", err=True)
-    uvicorn.run(
-        app,
-        host=settings.host,
-        port=settings.port,
-        root_path=settings.root_path,
-        access_log=False,
-        log_config=uvicorn_logging(settings.log_level),
-        server_header=False,
-        timeout_graceful_shutdown=30,
-    )
+    with supervised_workers(settings.job_workers, app.state.services.log):
+        uvicorn.run(
+            app,
+            host=settings.host,
+            port=settings.port,
+            root_path=settings.root_path,
+            access_log=False,
+            log_config=uvicorn_logging(settings.log_level),
+            server_header=False,
+            timeout_graceful_shutdown=30,
+        )
+
+
+def worker(
+    context: typer.Context,
+    slot: Annotated[int, typer.Option(min=0, help="Number of this worker on this machine; each has its own.")] = 0,
+    attached: Annotated[bool, typer.Option("--attached", help="End when standard input ends.")] = False,
+) -> None:
+    """Do jobs until told to stop."""
+    settings = load_settings()
+    settings = settings.model_copy(update={"threads": settings.threads or 1})
+    run_worker(settings, context.obj(settings), slot, attached=attached)
 
 
 def openapi(

@@ -1,14 +1,14 @@
 """What commands share: progress on a terminal, files that are not overwritten, output for machines."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import typer
 from pydantic import BaseModel
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from model.errors import InvalidParameter
 from model.inference.reconstruction import Watch
@@ -26,6 +26,16 @@ def progress(total: int) -> Iterator[Watch]:
             bar.update(task, description=name, advance=1)
 
         yield step
+
+
+@contextmanager
+def bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on standard error that is told name, items done and items in all; silent in a pipe."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as shown:
+        task = shown.add_task("", total=None)
+        yield lambda name, done, total: shown.update(task, description=name, completed=done, total=total or None)
 
 
 def require_free(paths: dict[str, Path | None], *, force: bool) -> None:

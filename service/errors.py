@@ -9,8 +9,11 @@
         ├── Unauthorised           no key, or a wrong one
         ├── NotAcceptable          none of the accepted media types can be made
         ├── UnsupportedMediaType   the body's media type is not read
+    ├── ArchiveUnavailable     a picture archive cannot be reached; worth trying again
+    ├── ArchiveRefused         a picture archive does not take a request; not worth trying again
         ├── Abandoned              the client went away while its work was done
-        └── Cancelled              nobody wants the job any more
+        ├── Cancelled              nobody wants the job any more
+        └── NotReady               a job without a result: not done yet, failed or cancelled
     NotFound
     ├── UnknownJob                 never enqueued, or expired
     ├── UnknownResult              never kept, expired or deleted
@@ -71,8 +74,20 @@ class Cancelled(ServiceError):
     """Nobody wants the job any more."""
 
 
+class NotReady(ServiceError):
+    """A job without a result: not done yet, failed or cancelled."""
+
+
 class UnknownJob(NotFound):
     """Never enqueued, or expired."""
+
+
+class ArchiveUnavailable(ServiceError):
+    """A picture archive cannot be reached, or cannot answer now; the same request may succeed later."""
+
+
+class ArchiveRefused(ServiceError):
+    """A picture archive does not take a request, and would not take it later."""
 
 
 class UnknownResult(NotFound):
@@ -117,7 +132,10 @@ KINDS: dict[type[MorphoFlowError], Kind] = {
     NotAcceptable: Kind(406, "not-acceptable", "No acceptable media type"),
     UnsupportedMediaType: Kind(415, "unsupported-media-type", "Media type not supported"),
     Abandoned: Kind(499, "abandoned", "The client went away"),
+    NotReady: Kind(409, "not-ready", "The job has no result"),
     Cancelled: Kind(409, "cancelled", "The job was cancelled"),
+    ArchiveUnavailable: Kind(500, "internal-error", "Internal error"),
+    ArchiveRefused: Kind(500, "internal-error", "Internal error"),
     BundleError: Kind(500, "internal-error", "Internal error"),
     BundleIncomplete: Kind(500, "internal-error", "Internal error"),
     BundleCorrupt: Kind(500, "internal-error", "Internal error"),

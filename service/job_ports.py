@@ -129,6 +129,10 @@ class JobEngine(Protocol):
         """Identifiers of the jobs that ended before a moment."""
         ...
 
+    def unfinished(self) -> int:
+        """Jobs that wait or run."""
+        ...
+
     def backlog(self) -> int:
         """Parts that wait for a worker: what more workers would shorten."""
         ...

@@ -1,8 +1,10 @@
-"""The models of a service: the shipped ones and those of further folders.
+"""The models of a service: the shipped ones and those of further folders, found again while it runs.
 
-A model that cannot be opened is kept with its sentence and does not stop the others.
+A model that cannot be opened is kept with its sentence and does not stop the others. Several versions of one model
+stand side by side: ``name`` is the newest one, ``name@version`` a certain one.
 """
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -13,6 +15,8 @@ from model.errors import BundleError, InvalidParameter, UnknownModel
 from service.settings import Settings
 
 MANIFEST = "manifest.json"
+#: Between a model's name and its version.
+AT = "@"
 
 
 @dataclass(frozen=True)
@@ -24,33 +28,62 @@ class BrokenModel:
 
 
 class ModelRegistry:
-    """The `Catalogue` of models in memory."""
+    """The `Catalogue` of models in memory.
 
-    def __init__(self, models: Mapping[str, ShapeModel], broken: Iterable[BrokenModel] = ()) -> None:
-        self._models = dict(models)
+    Args:
+        models: by name, or by name and version.
+        broken: what could not be opened.
+        reload: finds both anew.
+    """
+
+    def __init__(
+        self,
+        models: Mapping[str, ShapeModel],
+        broken: Iterable[BrokenModel] = (),
+        reload: "Callable[[], ModelRegistry] | None" = None,
+    ) -> None:
+        pinned = {pinned_name(model): model for model in models.values()}
+        self._models = {**pinned, **_newest(pinned.values()), **models}
+        self._reload = reload
         self.broken = tuple(broken)
 
     def names(self) -> tuple[str, ...]:
         """Names of the loaded models, in order."""
-        return tuple(sorted(self._models))
+        return tuple(sorted(name for name in self._models if AT not in name))
 
     def get(self, name: str | None) -> ShapeModel:
-        """A model by name; the only one when `name` is None."""
+        """A model by name, or by name and version; the only one when `name` is None."""
+        models = self._models
         if name is None:
             return self._only()
-        if name not in self._models:
+        if name not in models:
             raise UnknownModel(f"No loaded model has this name; loaded are: {', '.join(self.names()) or 'none'}.")
-        return self._models[name]
+        return models[name]
+
+    def refresh(self) -> bool:
+        """Load what is new and drop what is gone; requests that run keep their model. Whether anything changed."""
+        if self._reload is None:
+            return False
+        found = self._reload()
+        changed = _digests(found._models) != _digests(self._models) or found.broken != self.broken
+        self._models, self.broken = found._models, found.broken
+        return changed
 
     def _only(self) -> ShapeModel:
-        if len(self._models) != 1:
-            loaded = ", ".join(self.names()) or "none"
+        names = self.names()
+        if len(names) != 1:
+            loaded = ", ".join(names) or "none"
             raise InvalidParameter(f"The parameter model must name one of the loaded models: {loaded}.", part="model")
-        return next(iter(self._models.values()))
+        return self._models[names[0]]
+
+
+def pinned_name(model: ShapeModel) -> str:
+    """``name@version``, which names the same model for ever."""
+    return f"{model.manifest.name}{AT}{model.manifest.version}"
 
 
 def load_models(folders: Iterable[Path], open_model: Callable[[Path], ShapeModel]) -> ModelRegistry:
-    """Open every bundle of the folders; of two with one name the first stays."""
+    """Open every bundle of the folders; of two with one name and version the first stays."""
     models: dict[str, ShapeModel] = {}
     broken: list[BrokenModel] = []
     for folder in folders:
@@ -60,18 +93,40 @@ def load_models(folders: Iterable[Path], open_model: Callable[[Path], ShapeModel
             reason = str(fault) if isinstance(fault, BundleError) else "The bundle's folder cannot be read."
             broken.append(BrokenModel(folder.name, reason))
             continue
-        if model.manifest.name in models:
-            broken.append(BrokenModel(folder.name, f"Another bundle is called {model.manifest.name} as well."))
+        name = pinned_name(model)
+        if name in models:
+            broken.append(BrokenModel(folder.name, f"Another bundle is called {name} as well."))
         else:
-            models[model.manifest.name] = model
+            models[name] = model
     return ModelRegistry(models, broken)
 
 
 def load_registry(settings: Settings) -> ModelRegistry:
     """The registry that the settings ask for."""
     shipped = (Path(str(resources.files("model"))) / "bundles",) if settings.shipped_models else ()
-    folders = [bundle for root in (*shipped, *settings.models) for bundle in find_bundles(root)]
-    return load_models(folders, lambda folder: open_bundle(folder, backend=settings.backend, threads=settings.threads))
+    once = OpenedOnce(lambda folder: open_bundle(folder, backend=settings.backend, threads=settings.threads))
+
+    def load() -> ModelRegistry:
+        return load_models([bundle for root in (*shipped, *settings.models) for bundle in find_bundles(root)], once)
+
+    found = load()
+    return ModelRegistry(found._models, found.broken, load)
+
+
+class OpenedOnce:
+    """Opens a bundle when it is new or its manifest, which holds the hashes of all of its files, has changed."""
+
+    def __init__(self, open_model: Callable[[Path], ShapeModel]) -> None:
+        self._open = open_model
+        self._opened: dict[Path, tuple[bytes, ShapeModel]] = {}
+
+    def __call__(self, folder: Path) -> ShapeModel:
+        """The model of a folder."""
+        manifest = folder / MANIFEST
+        content = manifest.read_bytes() if manifest.is_file() else b""
+        if folder not in self._opened or self._opened[folder][0] != content:
+            self._opened[folder] = content, self._open(folder)
+        return self._opened[folder][1]
 
 
 def find_bundles(root: Path) -> Iterator[Path]:
@@ -80,3 +135,15 @@ def find_bundles(root: Path) -> Iterator[Path]:
         yield root
     elif root.is_dir():
         yield from sorted(folder for folder in root.iterdir() if folder.is_dir() and not folder.name.startswith("."))
+
+
+def _newest(models: Iterable[ShapeModel]) -> dict[str, ShapeModel]:
+    return {model.manifest.name: model for model in sorted(models, key=lambda model: _order(model.manifest.version))}
+
+
+def _order(version: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in re.findall(r"\d+", version))
+
+
+def _digests(models: Mapping[str, ShapeModel]) -> dict[str, str]:
+    return {name: model.digest for name, model in models.items()}

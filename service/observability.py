@@ -4,6 +4,7 @@ Neither holds a file name, a value of an image header, a query or the path of a 
 route as it stands in the interface.
 """
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -12,6 +13,8 @@ from typing import Any, TextIO
 import structlog
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
 
+from service.errors import Overloaded
+from service.job_ports import JobEngine
 from service.ports import WorkEngine
 
 #: Upper bounds (s) of the latency histograms.
@@ -39,7 +42,7 @@ def make_log(level: str, stream: TextIO | None = None) -> Log:
 class Metrics:
     """Counters of one application."""
 
-    def __init__(self, engine: WorkEngine) -> None:
+    def __init__(self, engine: WorkEngine, jobs: JobEngine) -> None:
         self._registry = CollectorRegistry()
         self.requests = Counter(
             "morphoflow_requests", "Requests answered", ["method", "route", "status"], registry=self._registry
@@ -59,6 +62,9 @@ class Metrics:
             registry=self._registry,
         )
         self._gauge("morphoflow_work_waiting", "Requests that wait for a worker", engine.waiting)
+        self._gauge(
+            "morphoflow_jobs_waiting_parts", "Parts of jobs that wait for a worker", lambda: _known(jobs.backlog)
+        )
         self._gauge("morphoflow_work_running", "Workers that are busy", engine.running)
         ProcessCollector(registry=self._registry)
 
@@ -66,8 +72,16 @@ class Metrics:
         """All of it in the text format of Prometheus."""
         return generate_latest(self._registry)
 
-    def _gauge(self, name: str, text: str, value: Callable[[], int]) -> None:
+    def _gauge(self, name: str, text: str, value: Callable[[], float]) -> None:
         Gauge(name, text, registry=self._registry).set_function(value)
+
+
+def _known(figure: Callable[[], int]) -> float:
+    """The figure, or that there is none now (NaN): metrics are told even while a database is away."""
+    try:
+        return figure()
+    except Overloaded:
+        return math.nan
 
 
 class StageTimer:

@@ -18,6 +18,8 @@ from model.inference.observations import MaskStack
 from model.inference.reconstruction import Options, Reconstruction
 
 T = TypeVar("T")
+#: Kinds of jobs of the interface: bulk sampling, one reconstruction in the background, one for each mask of an archive.
+SAMPLES_JOB, RECONSTRUCTION_JOB, RECONSTRUCTIONS_JOB = "samples", "reconstruction", "reconstructions"
 #: A file as it came: its bytes, where it lies, or open for reading from its start.
 MaskSource = bytes | Path | BinaryIO
 
@@ -85,7 +87,7 @@ class Catalogue(Protocol):
         ...
 
     def get(self, name: str | None) -> ShapeModel:
-        """A model by name; the only one when `name` is None.
+        """A model by name, or by ``name@version``; the only one when `name` is None.
 
         Raises:
             UnknownModel: no model of that name.
@@ -97,8 +99,8 @@ class Catalogue(Protocol):
 class ResultStore(Protocol):
     """Keeps outcomes for a limited time."""
 
-    def save(self, outcome: Outcome) -> StoredResult:
-        """Keep an outcome under a new random identifier.
+    def save(self, outcome: Outcome, identifier: str | None = None) -> StoredResult:
+        """Keep an outcome under a new random identifier, or under one that the caller drew.
 
         Raises:
             StoreFull: larger than everything that may be kept.

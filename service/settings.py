@@ -59,6 +59,18 @@ class Settings(BaseSettings):
     max_samples: int = Field(256, ge=1, description="most shapes of a batch")
     workers: int = Field(2, ge=1, le=256, description="reconstructions and samples computed at the same time")
     max_waiting: int = Field(8, ge=0, description="requests that may wait for a worker")
+    jobs_database: SecretStr = Field(
+        SecretStr(""), description="where jobs are kept: postgresql://user@host/name; a file of SQLite when left out"
+    )
+    storage_url: str = Field("", description="where results and files of jobs are kept: s3://bucket/prefix")
+    storage_endpoint: str = Field("", description="address of S3-compatible storage other than Amazon's")
+    replica: str = Field("", description="name of this machine among the others; the host's when left out")
+    job_workers: int = Field(1, ge=0, le=256, description="processes beside the service that do jobs")
+    job_nice: int = Field(15, ge=0, le=19, description="how far jobs stand back behind requests (nice)")
+    job_lease_s: float = Field(10.0, ge=1.0, description="a job worker not seen for so long is taken for gone")
+    max_jobs: int = Field(64, ge=0, description="jobs that may wait or run")
+    max_job_samples: int = Field(100_000, ge=1, description="most shapes of a job")
+    max_job_masks: int = Field(10_000, ge=1, description="most masks of a job")
     retry_after_s: int = Field(10, ge=1, description="when a refused client is told to come back")
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="least severe entry logged")
 

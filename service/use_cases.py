@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from model.bundle import ShapeModel
-from model.errors import InvalidParameter, TooLarge
+from model.errors import InvalidParameter, TooLarge, UnknownModel
 from model.geometry import Grid, Pose
 from model.inference.fitting import Fit, FitStatus
 from model.inference.observations import MaskStack
@@ -146,11 +146,14 @@ def _too_many_voxels(max_voxels: int) -> TooLarge:
 
 
 def _same_model(catalogue: Catalogue, outcome: Outcome) -> ShapeModel:
-    if outcome.model_name in catalogue.names():
-        model = catalogue.get(outcome.model_name)
-        if model.digest == outcome.model_digest:
-            return model
-    raise NotComputed("The model that made this reconstruction is no longer loaded; its summary and mesh are.")
+    gone = NotComputed("The model that made this reconstruction is no longer loaded; its summary and mesh are.")
+    try:
+        model = catalogue.get(f"{outcome.model_name}@{outcome.model_version}")
+    except UnknownModel:
+        raise gone from None
+    if model.digest != outcome.model_digest:
+        raise gone
+    return model
 
 
 def _require_uncertainty(outcome: Outcome) -> None:

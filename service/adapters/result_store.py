@@ -44,15 +44,16 @@ class DiskResultStore:
         self._clock = clock
         self._lock = threading.Lock()
 
-    def save(self, outcome: Outcome) -> StoredResult:
+    def save(self, outcome: Outcome, identifier: str | None = None) -> StoredResult:
         """Keep an outcome; `StoreFull` when it alone is larger than the store."""
-        identifier, now = str(uuid.uuid4()), self._clock()
-        temporary = self._folder / f"{_TEMPORARY}{identifier}"
+        identifier, now = identifier or str(uuid.uuid4()), self._clock()
+        temporary = self._folder / f"{_TEMPORARY}{uuid.uuid4()}"
         temporary.mkdir(mode=0o700)
         try:
             times = {"created": now, "expires": now + self._lifetime_s}
             write_outcome(temporary, outcome, times)
             with self._lock:
+                self._remove(self._folder / identifier)
                 self._make_room(_size(temporary))
                 temporary.rename(self._folder / identifier)
         except BaseException:

@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from model.bundle import ShapeModel
+from service.job_ports import BlobStore, JobEngine
 from service.model_registry import ModelRegistry
 from service.observability import Log, Metrics
 from service.ports import MaskReader, MeshWriter, ResultStore, Ticket, VolumeWriter, WorkEngine
@@ -24,6 +25,8 @@ class Services:
     read_mask: MaskReader
     write_mesh: MeshWriter
     write_volume: VolumeWriter
+    jobs: JobEngine
+    blobs: BlobStore
     metrics: Metrics
     log: Log
 

@@ -10,26 +10,28 @@ from model.errors import InvalidParameter, TooLarge, UnknownModel
 from model.inference.observations import MaskStack
 from model.inference.reconstruction import Watch
 from service import use_cases
-from service.errors import UnsupportedMediaType
 from service.observability import StageTimer
-from service.ports import MeshFormat, StoredResult
+from service.ports import RECONSTRUCTION_JOB, MeshFormat, StoredResult
 from service.presentation import result_summary
 from service.routes.connection import run_while_connected
-from service.routes.dependencies import Services, WithServices, WithTicket, address
+from service.routes.dependencies import Services, WithServices, address
+from service.routes.job_requests import (
+    JOB_ACCEPTED,
+    IdempotencyKey,
+    Prefer,
+    accepted_job,
+    prefers_async,
+    submit,
+    submittable_model,
+)
 from service.routes.meshes import mesh_bytes
+from service.routes.multipart import require_multipart
 from service.routes.negotiation import negotiate
 from service.routes.responses import DIRECT_FORMATS, JSON, MESH_MEDIA_TYPES, attachment, files, problems
 from service.schemas import ReconstructionForm, ResultSummary, parse_labels
 
 PATH = "/v1/reconstructions"
 _OFFERED = {JSON: None, **{MESH_MEDIA_TYPES[format]: format for format in DIRECT_FORMATS}}
-
-
-def require_multipart(request: Request) -> None:
-    """Refuse other bodies: `UnsupportedMediaType`."""
-    media = request.headers.get("content-type", "").split(";")[0].strip().lower()
-    if media != "multipart/form-data":
-        raise UnsupportedMediaType("The request's body must be multipart/form-data with one or more parts named mask.")
 
 
 def accepted_format(request: Request) -> MeshFormat | None:
@@ -57,6 +59,7 @@ def reconstructions_router() -> APIRouter:
                 (MESH_MEDIA_TYPES[format] for format in DIRECT_FORMATS),
                 "the mesh itself, when Accept asks for one; Content-Location says where it is kept",
             ),
+            202: JOB_ACCEPTED,
             **problems(400, 406, 413, 415, 422, 503, 507),
         },
     )
@@ -68,16 +71,30 @@ async def create_reconstruction(
     form: Annotated[ReconstructionForm, Form(media_type="multipart/form-data")],
     wanted: Annotated[MeshFormat | None, Depends(accepted_format)],
     services: WithServices,
-    ticket: WithTicket,
+    prefer: Prefer = None,
+    key: IdempotencyKey = None,
 ) -> Response:
     """Fits the model to the annotated planes of the masks.
 
-    Answers the summary, or the mesh itself when the header Accept asks for a mesh format.
+    Answers the summary, or the mesh itself when the header Accept asks for a mesh format; with `Prefer: respond-async`
+    a job at once.
     """
     if len(form.mask) > services.settings.max_masks:
         raise TooLarge(f"At most {services.settings.max_masks} parts named mask are accepted.", part="mask")
-    result = await run_while_connected(request, ticket, lambda watch: _reconstruct(services, form, watch))
+    if prefers_async(prefer):
+        return await run_in_threadpool(_enqueue, request, services, form, key)
+    with services.engine.admit() as ticket:
+        result = await run_while_connected(request, ticket, lambda watch: _reconstruct(services, form, watch))
     return await run_in_threadpool(_answer, request, services, result, wanted)
+
+
+def _enqueue(request: Request, services: Services, form: ReconstructionForm, key: str | None) -> Response:
+    model = submittable_model(services, form.model)
+    form.options()
+    parse_labels(form.label)
+    argument = form.model_dump(exclude={"mask", "model"}) | {"model": model, "masks": len(form.mask)}
+    inputs = [mask.file.read() for mask in form.mask]
+    return accepted_job(request, submit(services, RECONSTRUCTION_JOB, argument, inputs, key))
 
 
 def _reconstruct(services: Services, form: ReconstructionForm, watch: Watch) -> StoredResult:

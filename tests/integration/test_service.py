@@ -149,12 +149,6 @@ def test_an_unknown_media_type_is_refused_before_any_work(client):
     assert "model/stl" in problem(answer, 406)["detail"]
 
 
-def test_respond_async_is_not_applied(client):
-    answer = client.post(RECONSTRUCTIONS, files=mask_parts(), headers={"Prefer": "respond-async"})
-    assert answer.status_code == 201
-    assert "preference-applied" not in answer.headers
-
-
 def test_two_stacks_are_one_object_and_the_first_ones_grid_counts(client):
     values, grid = sparse_ellipsoid(AXES)
     ellipsoid, _ = truth()

@@ -12,6 +12,7 @@ from service.adapters.jobs.database import (
     APPLICATION,
     JOB,
     JOBS_QUEUE,
+    PARTS_QUEUE,
     RECORDS_VERSION,
     SCHEMA,
     Leases,
@@ -96,7 +97,11 @@ class DbosJobs:
 
     def backlog(self) -> int:
         """Parts that wait for a worker."""
-        return self._open()[1].waiting_parts()
+        return self._open()[1].count(PARTS_QUEUE, "ENQUEUED")
+
+    def unfinished(self) -> int:
+        """Jobs that wait or run."""
+        return self._open()[1].count(JOBS_QUEUE, "ENQUEUED", "PENDING")
 
     def workers(self, lease_s: float) -> int:
         """How many workers are alive."""

@@ -103,12 +103,12 @@ class Leases:
         with self._engine.begin() as connection:
             connection.execute(sa.delete(_LEASES).where(_LEASES.c.executor == executor))
 
-    def waiting_parts(self) -> int:
-        """Parts that no executor has begun."""
+    def count(self, queue: str, *states: str) -> int:
+        """Workflows of a queue in one of the states."""
         schema = None if self._engine.dialect.name == "sqlite" else SCHEMA
         table = sa.table("workflow_status", sa.column("queue_name"), sa.column("status"), schema=schema)
         query = sa.select(sa.func.count()).select_from(table)
-        query = query.where(table.c.queue_name == PARTS_QUEUE, table.c.status == "ENQUEUED")
+        query = query.where(table.c.queue_name == queue, table.c.status.in_(states))
         with self._engine.connect() as connection:
             return int(connection.execute(query).scalar_one())
 

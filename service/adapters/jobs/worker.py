@@ -31,6 +31,7 @@ from service.adapters.jobs.database import (
 )
 from service.errors import KINDS, Cancelled
 from service.job_ports import Check, JobKind, Record
+from service.observability import Log, make_log
 
 #: Jobs that one worker follows at the same time; following one is waiting for its parts.
 JOBS_FOLLOWED = 16
@@ -64,7 +65,7 @@ class WorkerOptions:
 
 
 @contextmanager
-def running_worker(kinds: Sequence[JobKind], options: WorkerOptions) -> Iterator[None]:
+def running_worker(kinds: Sequence[JobKind], options: WorkerOptions, log: Log | None = None) -> Iterator[None]:
     """A worker that takes jobs of these kinds while the context lasts; parts begun are finished or handed back."""
     serializer = json_serializer()
     prepare(options.url)
@@ -80,7 +81,7 @@ def running_worker(kinds: Sequence[JobKind], options: WorkerOptions) -> Iterator
         "run_migrations": False,
     }
     dbos, busy = DBOS(config=config), _Busy()
-    _register({kind.name: kind for kind in kinds}, jobs, busy)
+    _register({kind.name: kind for kind in kinds}, jobs, busy, log or make_log("error"))
     DBOS.listen_queues([JOBS_QUEUE, PARTS_QUEUE])
     leases, stop = Leases(options.url), threading.Event()
     leases.renew(options.executor)
@@ -128,7 +129,7 @@ class _Busy:
             self._changed.wait_for(lambda: self._count == 0, limit_s)
 
 
-def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: _Busy) -> None:
+def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: _Busy, log: Log) -> None:
     @DBOS.workflow(name=PART, max_recovery_attempts=MAX_DEATHS)
     def part(job: str, kind: str, name: str, item: dict[str, Any]) -> dict[str, Any]:
         check = _rarely(lambda: _require_wanted(jobs, job))
@@ -139,7 +140,7 @@ def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: _Busy) -> None
             "max_attempts": ATTEMPTS,
             "should_retry": lambda error: isinstance(error, OSError),
         }
-        with busy.one():
+        with busy.one(), _told(log, job):
             return dict(DBOS.run_step(options, kinds[kind].parts[name], item, check))
 
     @DBOS.workflow(name=JOB, max_recovery_attempts=None)
@@ -155,6 +156,18 @@ def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: _Busy) -> None
             if error.name not in _PROJECT_ERRORS:
                 raise
             return {"problem": error.message}
+
+
+@contextmanager
+def _told(log: Log, job: str) -> Iterator[None]:
+    """Log what is no error of this project's own."""
+    try:
+        yield
+    except MorphoFlowError:
+        raise
+    except Exception as fault:
+        log.error("fault in a job", job=job, exc_info=fault)
+        raise
 
 
 class _Run:

@@ -1,0 +1,63 @@
+"""Files by key in a folder: written under another name and renamed, so that nobody meets half of one."""
+
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import BinaryIO
+
+_TEMPORARY = ".tmp-"
+
+
+class FolderBlobs:
+    """The `BlobStore` on a folder of the file system, readable by its owner alone."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def put(self, key: str, data: bytes) -> None:
+        """Write a file, over an older one; on the disk when this returns."""
+        self._write(key, lambda file: file.write(data))
+
+    def put_file(self, key: str, path: Path) -> None:
+        """Write a copy of a file."""
+        with path.open("rb") as source:
+            self._write(key, lambda file: shutil.copyfileobj(source, file))
+
+    def get(self, key: str) -> bytes:
+        """Content of a file; `FileNotFoundError` when it is not there."""
+        return self._path(key).read_bytes()
+
+    def exists(self, key: str) -> bool:
+        """Whether a file is there."""
+        return self._path(key).is_file()
+
+    def list(self, prefix: str) -> Iterable[str]:
+        """Keys below a folder."""
+        for path in self._path(prefix).rglob("*"):
+            if path.is_file() and not path.name.startswith(_TEMPORARY):
+                yield path.relative_to(self._folder).as_posix()
+
+    def delete(self, prefix: str) -> None:
+        """Remove everything below a folder."""
+        shutil.rmtree(self._path(prefix), ignore_errors=True)
+
+    def _write(self, key: str, write: Callable[[BinaryIO], object]) -> None:
+        target = self._path(key)
+        target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        temporary = target.with_name(f"{_TEMPORARY}{uuid.uuid4().hex}")
+        try:
+            with temporary.open("xb") as file:
+                write(file)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(target)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+    def _path(self, key: str) -> Path:
+        if any(part in ("", ".", "..") for part in key.rstrip("/").split("/")):
+            raise ValueError("A key consists of names, separated by slashes.")
+        return self._folder / key

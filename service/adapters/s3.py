@@ -1,0 +1,88 @@
+"""Files by key in a bucket of S3-compatible storage."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import boto3
+from botocore.config import Config
+from botocore.exceptions import BotoCoreError, ClientError
+
+#: Codes that say that an object is not there.
+_MISSING = ("404", "NoSuchKey", "NotFound")
+
+
+class S3Blobs:
+    """The `BlobStore` in a bucket; keys and region come from the environment, as with every tool for S3.
+
+    Args:
+        url: ``s3://bucket`` or ``s3://bucket/prefix``.
+        endpoint: address of storage other than Amazon's.
+    """
+
+    def __init__(self, url: str, endpoint: str | None) -> None:
+        place = urlsplit(url)
+        self._bucket = place.netloc
+        self._prefix = f"{place.path.strip('/')}/".lstrip("/")
+        config = Config(
+            retries={"max_attempts": 4, "mode": "standard"},
+            connect_timeout=5,
+            read_timeout=30,
+            s3={"addressing_style": "path"} if endpoint else {},
+            request_checksum_calculation="when_required",  # other servers than Amazon's may know no newer ones
+            response_checksum_validation="when_required",
+        )
+        self._client = boto3.client("s3", endpoint_url=endpoint, config=config)
+
+    def put(self, key: str, data: bytes) -> None:
+        """Write an object, over an older one."""
+        with _as_os_errors():
+            self._client.put_object(Bucket=self._bucket, Key=self._prefix + key, Body=data)
+
+    def put_file(self, key: str, path: Path) -> None:
+        """Write a copy of a file, in several pieces when it is large."""
+        with _as_os_errors():
+            self._client.upload_file(str(path), self._bucket, self._prefix + key)
+
+    def get(self, key: str) -> bytes:
+        """Content of an object; `FileNotFoundError` when it is not there."""
+        with _as_os_errors():
+            content: bytes = self._client.get_object(Bucket=self._bucket, Key=self._prefix + key)["Body"].read()
+        return content
+
+    def exists(self, key: str) -> bool:
+        """Whether an object is there."""
+        try:
+            with _as_os_errors():
+                self._client.head_object(Bucket=self._bucket, Key=self._prefix + key)
+        except FileNotFoundError:
+            return False
+        return True
+
+    def list(self, prefix: str) -> Iterable[str]:
+        """Keys below a folder."""
+        with _as_os_errors():
+            pages = self._client.get_paginator("list_objects_v2")
+            for page in pages.paginate(Bucket=self._bucket, Prefix=self._prefix + prefix):
+                for item in page.get("Contents", []):
+                    yield item["Key"].removeprefix(self._prefix)
+
+    def delete(self, prefix: str) -> None:
+        """Remove everything below a folder."""
+        for key in list(self.list(prefix)):
+            with _as_os_errors():
+                self._client.delete_object(Bucket=self._bucket, Key=self._prefix + key)
+
+
+@contextmanager
+def _as_os_errors() -> Iterator[None]:
+    """Failures of storage as failures of the medium, without addresses or keys."""
+    try:
+        yield
+    except ClientError as error:
+        if error.response.get("Error", {}).get("Code") in _MISSING:
+            raise FileNotFoundError("The object is not there.") from None
+        raise OSError("The object storage refused the request.") from error
+    except BotoCoreError as error:
+        raise OSError("The object storage does not answer.") from error

@@ -1,0 +1,184 @@
+"""The commands ``jobs ...``: long work from the command line, by the same engine and with the same progress."""
+
+import time
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from model.errors import InvalidParameter
+from model.inference.fitting import MirrorRule
+from model.inference.reconstruction import UncertaintyRule
+from service import use_cases
+from service.commands import ForceOption, JsonOption, ModelOption
+from service.console import bar, echo_json, require_free
+from service.errors import NotReady
+from service.job_files import JobFiles
+from service.job_ports import BlobStore, JobEngine, JobState, JobStatus
+from service.job_presentation import job_summary
+from service.job_results import write_zip
+from service.jobs.reconstructions import zip_of_folder
+from service.jobs.worker import supervised_workers
+from service.model_registry import pinned_name
+from service.observability import make_log
+from service.ports import RECONSTRUCTIONS_JOB, SAMPLES_JOB, MeshFormat, SampleFormat
+from service.schemas import parse_annotated, parse_labels
+from service.settings import Settings, load_settings
+from service.stores import open_blobs, open_jobs
+
+#: How often (s) a job is looked at.
+_POLL_S = 0.5
+
+OutputOption = Annotated[Path | None, typer.Option(help="ZIP to write; waits for the job. Left out: only begins it.")]
+KeyOption = Annotated[str | None, typer.Option(help="The same key with the same kind leads to the same job.")]
+IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Identifier of the job.")]
+
+
+def jobs_commands() -> typer.Typer:
+    """The group of commands."""
+    app = typer.Typer(help="Long work that survives a restart.")
+    app.command("sample")(sample_job)
+    app.command("reconstruct")(reconstruct_job)
+    app.command("watch")(watch_job)
+    app.command("cancel")(cancel_job)
+    return app
+
+
+def sample_job(
+    context: typer.Context,
+    output: OutputOption = None,
+    model: ModelOption = None,
+    count: Annotated[int, typer.Option(help="How many.")] = 16,
+    seed: Annotated[int, typer.Option(help="Seed of the first one; the next one's is one more.")] = 0,
+    format: Annotated[SampleFormat, typer.Option(help="File format.")] = SampleFormat.STL,
+    temperature: Annotated[float, typer.Option(help="Spread of the shapes; 1 is the population's.")] = 1.0,
+    spacing_mm: Annotated[float | None, typer.Option(help="Grid step (mm); the model's when left out.")] = None,
+    key: KeyOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw thousands of synthetic shapes."""
+    require_free({"--output": output}, force=force)
+    settings = load_settings()
+    chosen = context.obj(settings).get(model)
+    use_cases.batch_seeds(seed, count, settings.max_job_samples)
+    use_cases.require_step(chosen, spacing_mm, settings.max_voxels)
+    argument = {
+        "model": pinned_name(chosen),
+        "count": count,
+        "seed": seed,
+        "format": format.value,
+        "temperature": temperature,
+        "spacing_mm": spacing_mm,
+    }
+    _begin(settings, SAMPLES_JOB, argument, None, key, output, as_json=as_json)
+
+
+def reconstruct_job(
+    context: typer.Context,
+    masks: Annotated[Path, typer.Argument(metavar="MASKS", help="Folder or ZIP of masks, each of one object.")],
+    output: OutputOption = None,
+    model: ModelOption = None,
+    format: Annotated[MeshFormat, typer.Option(help="File format.")] = MeshFormat.STL,
+    label: Annotated[list[str] | None, typer.Option(help="Label value or values; all non-zero when left out.")] = None,
+    annotated: Annotated[str, typer.Option(help="auto, all, nonempty, or a JSON list of planes.")] = "auto",
+    uncertainty: Annotated[UncertaintyRule, typer.Option(help="How uncertainty is found.")] = "laplace",
+    mirror: Annotated[MirrorRule, typer.Option(help="Whether left and right are exchanged.")] = "never",
+    resolution_mm: Annotated[float | None, typer.Option(help="Grid step of the surface (mm).")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=use_cases.MAX_SEED, help="Makes the answer repeatable.")] = 0,
+    key: KeyOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Reconstruct each mask of a folder or a ZIP."""
+    require_free({"--output": output}, force=force)
+    parse_annotated(annotated), parse_labels(label or [])
+    settings = load_settings()
+    argument = {
+        "model": pinned_name(context.obj(settings).get(model)),
+        "format": format.value,
+        "label": label or [],
+        "annotated": annotated,
+        "uncertainty": uncertainty,
+        "mirror": mirror,
+        "resolution_mm": resolution_mm,
+        "seed": seed,
+    }
+    _begin(settings, RECONSTRUCTIONS_JOB, argument, _archive(masks), key, output, as_json=as_json)
+
+
+def watch_job(identifier: IdArgument, output: OutputOption = None, force: ForceOption = False) -> None:
+    """Follow a job to its end; --output writes what it made."""
+    require_free({"--output": output}, force=force)
+    settings = load_settings()
+    jobs, blobs = open_jobs(settings), open_blobs(settings)
+    _finish(jobs, blobs, jobs.status(identifier), output, as_json=False)
+
+
+def cancel_job(identifier: IdArgument, as_json: JsonOption = False) -> None:
+    """Stop a job."""
+    jobs = open_jobs(load_settings())
+    _tell(jobs.cancel(identifier), as_json=as_json)
+    jobs.close()
+
+
+def _begin(
+    settings: Settings,
+    kind: str,
+    argument: dict[str, Any],
+    archive: bytes | None,
+    key: str | None,
+    output: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    jobs, blobs = open_jobs(settings), open_blobs(settings)
+    identifier = jobs.new_id(kind, key)
+    if archive is not None:
+        JobFiles(blobs, identifier).put_input(0, archive)
+    status = jobs.enqueue(kind, argument, identifier)
+    if output is None:
+        _tell(status, as_json=as_json)
+        return
+    with _someone_works(settings, jobs.workers(settings.job_lease_s)):
+        _finish(jobs, blobs, status, output, as_json=as_json)
+
+
+@contextmanager
+def _someone_works(settings: Settings, alive: int) -> Iterator[None]:
+    """Workers of this command's own when no service runs that would do the job."""
+    with supervised_workers(0 if alive else max(1, settings.job_workers), make_log("error")):
+        yield
+
+
+def _finish(jobs: JobEngine, blobs: BlobStore, status: JobStatus, output: Path | None, *, as_json: bool) -> None:
+    with bar() as advance:
+        while not status.state.is_final:
+            time.sleep(_POLL_S)
+            status = jobs.status(status.id)
+            advance(status.kind, status.done, status.total)
+    if status.state is JobState.DONE and output is not None and status.result is not None:
+        with zipfile.ZipFile(output, "w") as archive:
+            write_zip(archive, JobFiles(blobs, status.id), status.kind, status.result["count"])
+    _tell(status, as_json=as_json)
+    jobs.close()
+    if status.state is not JobState.DONE:
+        raise NotReady(status.problem or f"The job has no result: it is {status.state.value}.")
+
+
+def _tell(status: JobStatus, *, as_json: bool) -> None:
+    if as_json:
+        echo_json(job_summary(status))
+    else:
+        typer.echo(f"{status.id} {status.state.value}: {status.done} of {status.total or '?'}")
+
+
+def _archive(masks: Path) -> bytes:
+    if masks.is_dir():
+        return zip_of_folder(masks)
+    if masks.is_file():
+        return masks.read_bytes()
+    raise InvalidParameter("MASKS must be a folder or a ZIP that exists.", part="MASKS")

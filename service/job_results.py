@@ -1,0 +1,26 @@
+"""What a job has made as the members of an archive: its files in order, and the manifest last."""
+
+import json
+import zipfile
+from collections.abc import Iterator
+
+from service.job_files import JobFiles
+
+MANIFEST = "manifest.json"
+
+
+def result_members(job: JobFiles, kind: str, count: int) -> Iterator[tuple[str, bytes]]:
+    """Names and contents, one item in memory at a time."""
+    entries = []
+    for number in range(count):
+        contents, entry = job.item(number)
+        entries.append(entry)
+        yield from contents.items()
+    manifest = {**job.note("manifest"), kind: entries}
+    yield MANIFEST, json.dumps(manifest, indent=1).encode()
+
+
+def write_zip(archive: zipfile.ZipFile, job: JobFiles, kind: str, count: int) -> None:
+    """All of it into an open archive."""
+    for name, data in result_members(job, kind, count):
+        archive.writestr(name, data)

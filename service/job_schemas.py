@@ -1,0 +1,94 @@
+"""Wire types of jobs."""
+
+from datetime import datetime
+from typing import Any, Literal
+
+from fastapi import UploadFile
+from pydantic import BaseModel, ConfigDict, Field
+
+from model.errors import InvalidParameter
+from service.job_ports import JobState
+from service.ports import RECONSTRUCTIONS_JOB, SAMPLES_JOB, MeshFormat, SampleFormat
+from service.schemas import Seed, SpacingMm, parse_annotated, parse_labels
+
+_OF_SAMPLES = ("count", "temperature", "spacing_mm")
+_OF_RECONSTRUCTIONS = ("archive", "label", "annotated", "uncertainty", "mirror", "resolution_mm")
+
+
+class JobForm(BaseModel):
+    """The parts of a request for a job."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    kind: Literal["samples", "reconstructions"] = Field(
+        description="bulk sampling, or one reconstruction for each mask"
+    )
+    model: str | None = Field(
+        None, description="model name, or name@version; may be left out when only one model is loaded"
+    )
+    format: SampleFormat = Field(SampleFormat.STL, description="file format; a mesh format for reconstructions")
+    seed: Seed = 0
+    count: int = Field(16, ge=1, description="of samples: how many")
+    temperature: float = Field(
+        1.0, gt=0.0, le=2.0, allow_inf_nan=False, description="of samples: spread of the shapes; 1 is the population's"
+    )
+    spacing_mm: SpacingMm | None = Field(None, description="of samples: grid step (mm); the model's when left out")
+    archive: UploadFile | None = Field(None, description="of reconstructions: a ZIP of masks, each of one object")
+    label: list[str] = Field(default_factory=list, description="of reconstructions: as of a single one")
+    annotated: str = Field("auto", description="of reconstructions: as of a single one")
+    uncertainty: Literal["laplace", "ensemble", "none"] = Field(
+        "laplace", description="of reconstructions: as of a single one"
+    )
+    mirror: Literal["auto", "never", "always"] = Field("never", description="of reconstructions: as of a single one")
+    resolution_mm: SpacingMm | None = Field(None, description="of reconstructions: as of a single one")
+
+    def argument(self, model: str) -> dict[str, Any]:
+        """The job's argument, checked, with the model that it was given to.
+
+        Raises:
+            InvalidParameter: a part belongs to the other kind, is missing, or out of its range.
+        """
+        other = _OF_RECONSTRUCTIONS if self.kind == SAMPLES_JOB else _OF_SAMPLES
+        for name in other:
+            if name in self.model_fields_set:
+                raise InvalidParameter(f"The parameter {name} is of no use to a job of kind {self.kind}.", part=name)
+        shared = {"model": model, "format": self.format.value, "seed": self.seed}
+        return {**shared, **(self._samples() if self.kind == SAMPLES_JOB else self._reconstructions())}
+
+    def _samples(self) -> dict[str, Any]:
+        return self.model_dump(include=set(_OF_SAMPLES))
+
+    def _reconstructions(self) -> dict[str, Any]:
+        if self.archive is None:
+            raise InvalidParameter(
+                f"A job of kind {RECONSTRUCTIONS_JOB} needs the part archive, a ZIP.", part="archive"
+            )
+        if self.format.value not in tuple(MeshFormat):
+            raise InvalidParameter(f"The parameter format must be one of: {', '.join(MeshFormat)}.", part="format")
+        parse_annotated(self.annotated)
+        parse_labels(self.label)
+        return self.model_dump(include=set(_OF_RECONSTRUCTIONS) - {"archive"})
+
+
+class JobLinks(BaseModel):
+    """Where a job and what it made are."""
+
+    self: str
+    events: str
+    result: str | None = Field(description="what it made, once it is done")
+
+
+class JobSummary(BaseModel):
+    """Where a job stands."""
+
+    id: str
+    kind: str = Field(description="samples, reconstructions or reconstruction")
+    state: JobState
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+    done: int = Field(description="items that are made")
+    total: int = Field(description="items in all; 0 until it is known")
+    remaining_s: float | None = Field(description="estimated time to its end (s); null while nothing is known")
+    problem: str | None = Field(description="why it failed")
+    links: JobLinks

@@ -1,0 +1,49 @@
+"""What the kinds of jobs work with, and how the choices of a request become a record and back."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from model.inference.reconstruction import Options
+from service.job_files import JobFiles
+from service.job_ports import BlobStore
+from service.observability import Log
+from service.ports import Catalogue, MaskReader, MeshWriter, ResultStore, VolumeWriter
+from service.schemas import parse_annotated, parse_labels
+
+
+@dataclass(frozen=True)
+class JobTools:
+    """The wired parts of a worker.
+
+    Attributes:
+        max_voxels: of any grid that is made on the way.
+        max_bytes: of one mask.
+        max_masks: of one job.
+    """
+
+    registry: Catalogue
+    store: ResultStore
+    blobs: BlobStore
+    read_mask: MaskReader
+    write_mesh: MeshWriter
+    write_volume: VolumeWriter
+    log: Log
+    max_voxels: int
+    max_bytes: int
+    max_masks: int
+
+    def files(self, job: str) -> JobFiles:
+        """The files of a job."""
+        return JobFiles(self.blobs, job)
+
+
+def options_of(record: Mapping[str, Any]) -> Options:
+    """The choices of a reconstruction request, from a job's argument."""
+    annotated = parse_annotated(record["annotated"])
+    return Options(annotated, record["uncertainty"], record["mirror"], record["resolution_mm"], record["seed"])
+
+
+def labels_of(record: Mapping[str, Any]) -> frozenset[int] | None:
+    """The labels of a reconstruction request, from a job's argument."""
+    return parse_labels(record["label"])

@@ -1,0 +1,116 @@
+"""The program of one worker process, and the processes that ``serve`` keeps beside itself.
+
+Workers run with low priority and one thread a network, so that requests which somebody waits for come first.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+
+from sqlalchemy.exc import DBAPIError
+
+from service.adapters.images import write_nifti
+from service.adapters.jobs.worker import WorkerOptions, running_worker
+from service.adapters.mesh_formats import write_mesh
+from service.app import mask_reader
+from service.errors import Overloaded
+from service.job_files import JobFiles
+from service.job_ports import BlobStore, JobEngine
+from service.jobs.kinds import all_kinds
+from service.jobs.tools import JobTools
+from service.model_registry import ModelRegistry
+from service.observability import Log, make_log
+from service.settings import Settings
+from service.stores import jobs_url, open_blobs, open_jobs, open_results, replica_name
+
+#: A worker that died is started again after so long (s).
+_RESTART_AFTER_S = 1.0
+
+
+def worker_options(settings: Settings, slot: int) -> WorkerOptions:
+    """How the worker of a slot works; its name is the same after each restart."""
+    return WorkerOptions(jobs_url(settings), f"{replica_name(settings)}-{slot}", settings.job_lease_s)
+
+
+def make_tools(settings: Settings, registry: ModelRegistry, log: Log) -> JobTools:
+    """The wired parts of a worker."""
+    blobs = open_blobs(settings)
+    return JobTools(
+        registry=registry,
+        store=open_results(settings, blobs),
+        blobs=blobs,
+        read_mask=mask_reader(settings),
+        write_mesh=write_mesh,
+        write_volume=write_nifti,
+        log=log,
+        max_voxels=settings.max_voxels,
+        max_bytes=settings.max_body_bytes,
+        max_masks=settings.max_job_masks,
+    )
+
+
+def run_worker(settings: Settings, registry: ModelRegistry, slot: int, *, attached: bool = False) -> None:
+    """Work until SIGTERM or SIGINT; attached, also until standard input ends because who held it is gone."""
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    if attached:
+        threading.Thread(target=_stop_with_input, args=(stop,), daemon=True).start()
+    os.nice(settings.job_nice)
+    log = make_log(settings.log_level)
+    tools = make_tools(settings, registry, log)
+    jobs = open_jobs(settings)
+    with running_worker(all_kinds(tools), worker_options(settings, slot), log):
+        log.info("worker started", slot=slot)
+        while not stop.wait(settings.sweep_interval_s):
+            remove_expired(jobs, tools.blobs, settings.result_lifetime_s, log)
+            registry.refresh()
+    jobs.close()
+    log.info("worker stopped", slot=slot)
+
+
+def _stop_with_input(stop: threading.Event) -> None:
+    sys.stdin.buffer.read()
+    stop.set()
+
+
+def remove_expired(jobs: JobEngine, blobs: BlobStore, lifetime_s: float, log: Log) -> None:
+    """Forget jobs that ended so long ago, with their files."""
+    try:
+        for identifier in jobs.ended_before(datetime.now(UTC) - timedelta(seconds=lifetime_s)):
+            JobFiles(blobs, identifier).remove()
+            jobs.forget(identifier)
+    except (OSError, DBAPIError, Overloaded):
+        log.warning("expired jobs cannot be removed")
+
+
+@contextmanager
+def supervised_workers(count: int, log: Log) -> Iterator[None]:
+    """So many worker processes while the context lasts; one that dies is started again under the same name."""
+    stop = threading.Event()
+    keepers = [threading.Thread(target=_keep, args=(slot, stop, log), name=f"worker-{slot}") for slot in range(count)]
+    for keeper in keepers:
+        keeper.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        for keeper in keepers:
+            keeper.join()
+
+
+def _keep(slot: int, stop: threading.Event, log: Log) -> None:
+    while not stop.is_set():
+        command = [sys.executable, "-m", "service.cli", "worker", "--slot", str(slot), "--attached"]
+        with subprocess.Popen(command, stdin=subprocess.PIPE) as worker:
+            while worker.poll() is None and not stop.wait(0.2):
+                continue
+            worker.terminate()
+        if not stop.is_set():
+            log.warning("worker ended and is started again", slot=slot, status=worker.returncode)
+            stop.wait(_RESTART_AFTER_S)

@@ -1,0 +1,170 @@
+"""``/v1/jobs``: long work that survives a restart, its progress, and what it made."""
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Form, Path, Request
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
+from zipstream import ZipStream  # type: ignore[import-untyped]
+
+from service import use_cases
+from service.errors import Cancelled, NotReady
+from service.job_files import JobFiles
+from service.job_ports import JobState, JobStatus
+from service.job_presentation import job_summary
+from service.job_results import MANIFEST, result_members
+from service.job_schemas import JobForm, JobSummary
+from service.ports import RECONSTRUCTION_JOB, SAMPLES_JOB
+from service.routes.dependencies import Services, WithServices, address
+from service.routes.job_requests import (
+    JOB_ACCEPTED,
+    JOBS_PATH,
+    IdempotencyKey,
+    accepted_job,
+    submit,
+    submittable_model,
+)
+from service.routes.multipart import require_multipart
+from service.routes.responses import ZIP, attachment, files, problems
+
+#: How often (s) a job is looked at for its events, and how often a silent line is sent so that proxies stay.
+_EVENT_POLL_S, _EVENT_SILENCE_S = 0.5, 15.0
+_EVENTS = {"description": "server-sent events", "content": {"text/event-stream": {"schema": {"type": "string"}}}}
+
+Identifier = Annotated[str, Path(alias="id", description="identifier of the job", json_schema_extra={"format": "uuid"})]
+
+
+def jobs_router() -> APIRouter:
+    """The routes."""
+    router = APIRouter(prefix=JOBS_PATH, tags=["jobs"])
+    router.add_api_route(
+        "",
+        create_job,
+        methods=["POST"],
+        status_code=202,
+        response_model=JobSummary,
+        dependencies=[Depends(require_multipart)],
+        summary="Bulk sampling, or a reconstruction for each mask of a ZIP",
+        responses={202: JOB_ACCEPTED, **problems(400, 413, 415, 422, 503, 507)},
+    )
+    one = "/{id}"
+    router.add_api_route(
+        one,
+        read_job,
+        methods=["GET"],
+        response_model=JobSummary,
+        summary="State and progress",
+        responses=problems(404, 503),
+    )
+    router.add_api_route(
+        one,
+        end_job,
+        methods=["DELETE"],
+        response_model=JobSummary,
+        summary="Cancel a job, or forget one that has ended",
+        responses={204: {"description": "it had ended, and is gone with its files"}, **problems(404, 503)},
+    )
+    router.add_api_route(
+        f"{one}/events",
+        read_events,
+        methods=["GET"],
+        response_class=StreamingResponse,
+        summary="Progress as it happens",
+        responses={200: _EVENTS, **problems(404, 503)},
+    )
+    router.add_api_route(
+        f"{one}/result",
+        read_result,
+        methods=["GET"],
+        response_class=Response,
+        summary="What a job has made",
+        responses={
+            200: files([ZIP], f"one file an item; {MANIFEST} comes last"),
+            303: {"description": "a single reconstruction stands at the address in Location"},
+            **problems(404, 409, 503),
+        },
+    )
+    return router
+
+
+def create_job(
+    request: Request,
+    form: Annotated[JobForm, Form(media_type="multipart/form-data")],
+    services: WithServices,
+    key: IdempotencyKey = None,
+) -> Response:
+    """Answers at once; the work is done by other processes and goes on after a restart."""
+    argument = form.argument(submittable_model(services, form.model))
+    if form.kind == SAMPLES_JOB:
+        _require_drawable(services, argument)
+    inputs = [] if form.archive is None else [form.archive.file.read()]
+    return accepted_job(request, submit(services, form.kind, argument, inputs, key))
+
+
+def read_job(identifier: Identifier, request: Request, services: WithServices) -> JobSummary:
+    """Items that are made, and the estimated time to the end."""
+    return job_summary(services.jobs.status(identifier), address(request, ""))
+
+
+def end_job(identifier: Identifier, request: Request, services: WithServices) -> Response:
+    """What runs stops within a second or at the end of its present stage; a job that had ended is forgotten."""
+    if services.jobs.status(identifier).state.is_final:
+        JobFiles(services.blobs, identifier).remove()
+        services.jobs.forget(identifier)
+        return Response(status_code=204)
+    summary = job_summary(services.jobs.cancel(identifier), address(request, ""))
+    return JSONResponse(summary.model_dump(mode="json"))
+
+
+async def read_events(identifier: Identifier, request: Request, services: WithServices) -> Response:
+    """An event `progress` with the job's summary at each change, then one called `end`."""
+    first = await run_in_threadpool(services.jobs.status, identifier)
+    stream = _events(services, first, address(request, ""))
+    return StreamingResponse(stream, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
+
+
+def read_result(identifier: Identifier, request: Request, services: WithServices) -> Response:
+    """A ZIP that streams while it is read; the same items as of single requests."""
+    status = services.jobs.status(identifier)
+    if status.state is JobState.CANCELLED:
+        raise Cancelled("The job was cancelled, so it has no result.")
+    if status.state is not JobState.DONE or status.result is None:
+        raise NotReady(f"The job has no result: it is {status.state.value}.")
+    if status.kind == RECONSTRUCTION_JOB:
+        return RedirectResponse(address(request, f"/v1/reconstructions/{identifier}"), 303)
+    chunks = _zip(JobFiles(services.blobs, identifier), status.kind, status.result["count"])
+    return StreamingResponse(chunks, media_type=ZIP, headers=attachment(f"{status.kind}.zip"))
+
+
+async def _events(services: Services, status: JobStatus, prefix: str) -> AsyncIterator[str]:
+    told, silent_s = None, 0.0
+    while True:
+        now = (status.state, status.done, status.total)
+        if now != told:
+            told, silent_s = now, 0.0
+            name = "end" if status.state.is_final else "progress"
+            yield f"event: {name}\ndata: {job_summary(status, prefix).model_dump_json()}\n\n"
+        if status.state.is_final:
+            return
+        if silent_s >= _EVENT_SILENCE_S:
+            silent_s = 0.0
+            yield ":\n\n"
+        await asyncio.sleep(_EVENT_POLL_S)
+        silent_s += _EVENT_POLL_S
+        status = await run_in_threadpool(services.jobs.status, status.id)
+
+
+def _zip(job: JobFiles, kind: str, count: int) -> Iterator[bytes]:
+    archive = ZipStream(sized=False)
+    for name, data in result_members(job, kind, count):
+        archive.add(data, name)
+        yield from archive.all_files()
+    yield from archive.finalize()
+
+
+def _require_drawable(services: Services, argument: dict[str, Any]) -> None:
+    use_cases.batch_seeds(argument["seed"], argument["count"], services.settings.max_job_samples)
+    model = services.registry.get(argument["model"])
+    use_cases.require_step(model, argument["spacing_mm"], services.settings.max_voxels)

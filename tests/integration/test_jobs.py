@@ -1,0 +1,152 @@
+"""Jobs over HTTP: asked for, followed, cancelled and fetched, by a real server with a real worker."""
+
+import io
+import json
+import zipfile
+
+import pytest
+
+from tests.job_parts import ended, working
+from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, running
+
+JOBS = "/v1/jobs"
+
+
+@pytest.fixture(scope="module")
+def app(tmp_path_factory):
+    return app_for(tmp_path_factory.mktemp("jobs"), max_job_samples=1000)
+
+
+@pytest.fixture(scope="module")
+def client(app):
+    with running(app) as client, working(app):
+        yield client
+
+
+def form(**parts):
+    return {name: (None, str(value)) for name, value in parts.items()}
+
+
+def archive_of(**masks: bytes) -> bytes:
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w") as archive:
+        for name, data in masks.items():
+            archive.writestr(f"masks/{name}.nii", data)
+        archive.writestr("masks/read.me", "no mask")
+    return target.getvalue()
+
+
+def members(response):
+    assert response.headers["content-type"] == "application/zip"
+    with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def test_bulk_samples_are_those_of_single_requests(client):
+    accepted = client.post(JOBS, files=form(kind="samples", count=9, seed=4, format="ply"))
+    assert accepted.status_code == 202
+    summary = ended(client, accepted.headers["location"])
+    assert (summary["state"], summary["done"], summary["total"]) == ("done", 9, 9)
+    files = members(client.get(summary["links"]["result"]))
+    manifest = json.loads(files.pop("manifest.json"))
+    assert [entry["seed"] for entry in manifest["samples"]] == list(range(4, 13))
+    assert list(files) == [entry["file"] for entry in manifest["samples"]]
+    assert files[f"{NAME}-7.ply"] == client.get(f"/v1/models/{NAME}/samples/7?format=ply").content
+
+
+def test_each_mask_of_an_archive_is_reconstructed_and_one_at_fault_stops_no_other(client):
+    archive = archive_of(a=mask_bytes(), b=b"no image", c=mask_bytes((12.0, 9.0, 8.0)))
+    parts = {**form(kind="reconstructions", uncertainty="none"), "archive": ("masks.zip", archive)}
+    summary = ended(client, client.post(JOBS, files=parts).headers["location"])
+    assert (summary["state"], summary["done"]) == ("done", 3)
+    files = members(client.get(summary["links"]["result"]))
+    first, second, third = json.loads(files["manifest.json"])["reconstructions"]
+    assert [entry["mask"] for entry in (first, second, third)] == [f"masks/{name}.nii" for name in "abc"]
+    assert "problem" in second
+    assert files[first["file"]] != files[third["file"]]
+    assert first["summary"]["fit"]["converged"]
+
+
+def test_a_reconstruction_may_be_asked_for_without_waiting(client):
+    waited = client.post("/v1/reconstructions", files=mask_parts(), data={"seed": "3"}).json()
+    accepted = client.post(
+        "/v1/reconstructions", files=mask_parts(), data={"seed": "3"}, headers={"Prefer": "respond-async, wait=1"}
+    )
+    assert accepted.status_code == 202
+    assert accepted.headers["preference-applied"] == "respond-async"
+    summary = ended(client, accepted.headers["location"])
+    result = client.get(f"{summary['links']['self']}/result", follow_redirects=True).json()
+    assert result["links"]["self"] == summary["links"]["result"]
+    assert result["volume_ml"] == waited["volume_ml"]
+
+
+def test_an_input_at_fault_fails_the_job_with_its_sentence(client):
+    accepted = client.post("/v1/reconstructions", files=mask_parts(b"no"), headers={"Prefer": "respond-async"})
+    summary = ended(client, accepted.headers["location"])
+    assert summary["state"] == "failed"
+    assert "mask[0]" in summary["problem"]
+    assert client.get(f"{accepted.headers['location']}/result").status_code == 409
+
+
+def test_the_same_key_leads_to_the_same_job_and_another_request_is_refused(client):
+    key = {"Idempotency-Key": "one"}
+    first = client.post(JOBS, files=form(kind="samples", count=2), headers=key).json()
+    again = client.post(JOBS, files=form(kind="samples", count=2), headers=key).json()
+    assert first["id"] == again["id"]
+    other = client.post(JOBS, files=form(kind="samples", count=3), headers=key)
+    assert (other.status_code, other.json()["part"]) == (422, "Idempotency-Key")
+
+
+def test_events_tell_the_progress_to_the_end(client):
+    place = client.post(JOBS, files=form(kind="samples", count=12)).json()["links"]
+    with client.stream("GET", place["events"]) as response:
+        assert response.headers["content-type"].startswith("text/event-stream")
+        lines = [line for line in response.iter_lines() if line]
+    names = [line.removeprefix("event: ") for line in lines if line.startswith("event: ")]
+    told = [json.loads(line.removeprefix("data: ")) for line in lines if line.startswith("data: ")]
+    assert set(names[:-1]) <= {"progress"}
+    assert names[-1] == "end"
+    assert [summary["done"] for summary in told] == sorted(summary["done"] for summary in told)
+    assert told[-1]["state"] == "done"
+
+
+def test_a_cancelled_job_stops_and_an_ended_one_is_forgotten(client):
+    place = client.post(JOBS, files=form(kind="samples", count=1000)).headers["location"]
+    assert client.delete(place).json()["state"] == "cancelled"
+    problem = client.get(f"{place}/result").json()
+    assert problem["type"] == "urn:morphoflow:problem:cancelled"
+    assert client.delete(place).status_code == 204
+    assert client.get(place).status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("parts", "part", "status"),
+    [
+        ({"kind": "samples", "count": 1001}, "count", 413),
+        ({"kind": "samples", "model": "hip"}, "model", 422),
+        ({"kind": "samples", "mirror": "auto"}, "mirror", 422),
+        ({"kind": "reconstructions"}, "archive", 422),
+        ({"kind": "reconstructions", "count": 3}, "count", 422),
+        ({"kind": "other"}, "kind", 422),
+        ({"kind": "samples", "colour": "red"}, "colour", 422),
+    ],
+)
+def test_requests_at_fault_are_refused_by_part(client, parts, part, status):
+    answer = client.post(JOBS, files=form(**parts))
+    assert (answer.status_code, answer.json()["part"]) == (status, part)
+
+
+def test_an_archive_without_masks_fails(client):
+    parts = {**form(kind="reconstructions"), "archive": ("masks.zip", archive_of())}
+    summary = ended(client, client.post(JOBS, files=parts).headers["location"])
+    assert summary["state"] == "failed"
+    assert "archive" in summary["problem"]
+
+
+def test_as_many_jobs_wait_as_may(tmp_path):
+    with running(app_for(tmp_path, max_jobs=1)) as client:
+        assert client.post(JOBS, files=form(kind="samples")).status_code == 202
+        refused = client.post(JOBS, files=form(kind="samples"))
+        assert refused.status_code == 503
+        assert int(refused.headers["retry-after"]) > 0
+        assert "morphoflow_jobs_waiting_parts 0.0" in client.get("/metrics").text
