@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Iterable
-from contextlib import asynccontextmanager, suppress
+from contextlib import AbstractContextManager, asynccontextmanager, nullcontext, suppress
 from functools import partial
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as installed_version
@@ -28,6 +28,7 @@ from service.routes.problems import install_handlers
 from service.routes.reconstructions import reconstructions_router
 from service.routes.results import results_router
 from service.routes.samples import samples_router
+from service.routes.stow import stow_router
 from service.schemas import Problem, SurfaceSd
 from service.settings import Settings
 from service.stores import open_blobs, open_jobs, open_results
@@ -65,21 +66,35 @@ def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log
         metrics=Metrics(engine, jobs),
         log=log or make_log(settings.log_level),
     )
+    pacs = _open_pacs(services)
     app = FastAPIOffline(
         redoc_url=None,
         generate_unique_id_function=operation_name,
         title=TITLE,
         version=INTERFACE_VERSION,
         description=DESCRIPTION,
-        lifespan=partial(_lifespan, services=services, sweep=store.sweep, close=(engine.close, jobs.close)),
+        lifespan=partial(_lifespan, services=services, pacs=pacs, sweep=store.sweep, close=(engine.close, jobs.close)),
     )
     app.state.services = services
+    app.state.pacs = pacs
     _add_routes(app)
     install_handlers(app, settings.retry_after_s)
     app.add_middleware(BodyLimitMiddleware, max_bytes=settings.max_body_bytes)
     app.add_middleware(KeyMiddleware, keys=settings.keys)
     app.add_middleware(AccessMiddleware, log=services.log, metrics=services.metrics)
     return app
+
+
+def _open_pacs(services: Services) -> AbstractContextManager[object]:
+    """What stands among picture archives while the service runs; nothing where no file is set."""
+    if services.settings.pacs_file is None:
+        return nullcontext()
+    from service.pacs import open_pacs  # the extra pacs is needed only here
+
+    pacs = open_pacs(services.settings, services.settings.pacs_file, services.blobs, services.jobs, services.log)
+    services.metrics.watch("morphoflow_dicom_backlog", "Accepted drawings not given back yet", pacs.inbox.backlog)
+    services.metrics.watch("morphoflow_dicom_quarantined", "Objects in quarantine", pacs.inbox.quarantined)
+    return pacs
 
 
 def interface_document() -> dict[str, Any]:
@@ -117,6 +132,7 @@ def _add_routes(app: FastAPI) -> None:
         models_router,
         samples_router,
         jobs_router,
+        stow_router,
         operations_router,
     ):
         app.include_router(router())
@@ -152,14 +168,20 @@ def _drop_foreign_errors(document: dict[str, Any]) -> None:
 
 @asynccontextmanager
 async def _lifespan(
-    _: FastAPI, *, services: Services, sweep: Callable[[], int], close: Iterable[Callable[[], None]]
+    _: FastAPI,
+    *,
+    services: Services,
+    pacs: AbstractContextManager[object],
+    sweep: Callable[[], int],
+    close: Iterable[Callable[[], None]],
 ) -> AsyncIterator[None]:
     for broken in services.registry.broken:
         services.log.error("broken model", model=broken.name, reason=broken.reason)
     services.log.info("started", models=services.registry.names())
     sweeper = asyncio.create_task(_sweep_for_ever(sweep, services))
     try:
-        yield
+        with pacs:
+            yield
     finally:
         sweeper.cancel()
         with suppress(asyncio.CancelledError):

@@ -61,18 +61,19 @@ class Metrics:
             buckets=LATENCY_BUCKETS_S,
             registry=self._registry,
         )
-        self._gauge("morphoflow_work_waiting", "Requests that wait for a worker", engine.waiting)
-        self._gauge(
+        self.watch("morphoflow_work_waiting", "Requests that wait for a worker", engine.waiting)
+        self.watch(
             "morphoflow_jobs_waiting_parts", "Parts of jobs that wait for a worker", lambda: _known(jobs.backlog)
         )
-        self._gauge("morphoflow_work_running", "Workers that are busy", engine.running)
+        self.watch("morphoflow_work_running", "Workers that are busy", engine.running)
         ProcessCollector(registry=self._registry)
 
     def exposition(self) -> bytes:
         """All of it in the text format of Prometheus."""
         return generate_latest(self._registry)
 
-    def _gauge(self, name: str, text: str, value: Callable[[], float]) -> None:
+    def watch(self, name: str, text: str, value: Callable[[], float]) -> None:
+        """Ask for a figure whenever metrics are read."""
         Gauge(name, text, registry=self._registry).set_function(value)
 
 

@@ -71,6 +71,9 @@ class Settings(BaseSettings):
     max_jobs: int = Field(64, ge=0, description="jobs that may wait or run")
     max_job_samples: int = Field(100_000, ge=1, description="most shapes of a job")
     max_job_masks: int = Field(10_000, ge=1, description="most masks of a job")
+    pacs_file: Path | None = Field(
+        None, description="TOML file that says how the service stands among picture archives; no DICOM when left out"
+    )
     retry_after_s: int = Field(10, ge=1, description="when a refused client is told to come back")
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="least severe entry logged")
 

@@ -20,7 +20,7 @@ from service.adapters.mesh_formats import write_mesh
 from service.app import mask_reader
 from service.errors import Overloaded
 from service.job_files import JobFiles
-from service.job_ports import BlobStore, JobEngine
+from service.job_ports import BlobStore, JobEngine, JobKind
 from service.jobs.kinds import all_kinds
 from service.jobs.tools import JobTools
 from service.model_registry import ModelRegistry
@@ -65,13 +65,22 @@ def run_worker(settings: Settings, registry: ModelRegistry, slot: int, *, attach
     log = make_log(settings.log_level)
     tools = make_tools(settings, registry, log)
     jobs = open_jobs(settings)
-    with running_worker(all_kinds(tools), worker_options(settings, slot), log):
+    with running_worker((*all_kinds(tools), *_pacs_kinds(settings, tools)), worker_options(settings, slot), log):
         log.info("worker started", slot=slot)
         while not stop.wait(settings.sweep_interval_s):
             remove_expired(jobs, tools.blobs, settings.result_lifetime_s, log)
             registry.refresh()
     jobs.close()
     log.info("worker stopped", slot=slot)
+
+
+def _pacs_kinds(settings: Settings, tools: JobTools) -> tuple[JobKind, ...]:
+    """Drawings from picture archives, where a file is set."""
+    if settings.pacs_file is None:
+        return ()
+    from service.jobs.pacs import pacs_kinds  # the extra pacs is needed only here
+
+    return pacs_kinds(settings, settings.pacs_file, tools.registry, tools.blobs, tools.log)
 
 
 def _stop_with_input(stop: threading.Event) -> None:

@@ -1,0 +1,155 @@
+"""The audit trail: DICOM audit messages (PS3.15, A.5) as JSON lines, each with the hash of the line before it.
+
+A line that is changed, removed or put in between breaks the chain from there on. Studies and instances are
+named by their UIDs, as the standard's messages name them; patients are not: the archive knows whose study
+it is.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+#: What stands for the line before the first.
+GENESIS = "0" * 64
+PROGRAM = "MorphoFlow"
+
+
+class AuditEvent(Enum):
+    """Event identification code (DCM), its meaning, and the event action code of the messages that are written."""
+
+    STARTED = ("110120", "Application Start", "E")
+    STOPPED = ("110121", "Application Stop", "E")
+    RECEIVED = ("110104", "DICOM Instances Transferred", "C")
+    FETCHED = ("110103", "DICOM Instances Accessed", "R")
+    SENT = ("110104", "DICOM Instances Transferred", "R")
+    REFUSED = ("110113", "Security Alert", "E")
+
+
+class Outcome(Enum):
+    """Event outcome indicator."""
+
+    SUCCESS = 0
+    MINOR_FAILURE = 4
+    SERIOUS_FAILURE = 8
+
+
+@dataclass(frozen=True)
+class AuditEntry:
+    """One event.
+
+    Attributes:
+        source, destination: who sent and who received: AE titles or names of archives.
+        study: Study Instance UID, empty without one.
+        instances: SOP Class UID and SOP Instance UID of each object.
+        note: a sentence without identifiers.
+    """
+
+    event: AuditEvent
+    source: str
+    destination: str
+    study: str = ""
+    instances: Sequence[tuple[str, str]] = ()
+    outcome: Outcome = Outcome.SUCCESS
+    note: str = ""
+
+
+class AuditTrail:
+    """The trail in one file, written by all processes of a machine in turn."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def write(self, entry: AuditEntry) -> None:
+        """Append one message; on disk when this returns."""
+        self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+        with os.fdopen(handle, "r+b") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            line = chained(message(entry, datetime.now(UTC)), _last_hash(file))
+            file.seek(0, os.SEEK_END)
+            file.write(line)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def broken_line(path: Path) -> int | None:
+    """Number of the first line that does not follow from the ones before it; None for a whole trail."""
+    previous = GENESIS
+    with path.open("rb") as file:
+        for number, line in enumerate(file, 1):
+            try:
+                found = json.loads(line)
+                if chained(found["message"], previous) != line or found["previous"] != previous:
+                    return number
+                previous = found["hash"]
+            except (ValueError, KeyError, TypeError):
+                return number
+    return None
+
+
+def chained(content: dict[str, Any], previous: str) -> bytes:
+    """A line: the message, the hash before it, and the hash over both."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    digest = hashlib.sha256(f"{previous}\n{text}".encode()).hexdigest()
+    line = json.dumps({"previous": previous, "hash": digest, "message": content}, sort_keys=True, ensure_ascii=False)
+    return f"{line}\n".encode()
+
+
+def message(entry: AuditEntry, now: datetime) -> dict[str, Any]:
+    """The audit message with the names of PS3.15, A.5.1."""
+    code, meaning, action = entry.event.value
+    by_class: dict[str, list[str]] = {}
+    for kind, instance in entry.instances:
+        by_class.setdefault(kind, []).append(instance)
+    study = {
+        "ParticipantObjectTypeCode": 2,
+        "ParticipantObjectTypeCodeRole": 3,
+        "ParticipantObjectIDTypeCode": {"csd-code": "110180", "codeSystemName": "DCM", "originalText": "Study UID"},
+        "ParticipantObjectID": entry.study,
+        "SOPClass": [{"UID": kind, "Instance": uids} for kind, uids in by_class.items()],
+    }
+    return {
+        "EventIdentification": {
+            "EventID": {"csd-code": code, "codeSystemName": "DCM", "originalText": meaning},
+            "EventActionCode": action,
+            "EventDateTime": now.isoformat(timespec="milliseconds"),
+            "EventOutcomeIndicator": entry.outcome.value,
+            **({"EventOutcomeDescription": entry.note} if entry.note else {}),
+        },
+        "ActiveParticipant": [
+            _participant(entry.source, "110153", "Source Role ID"),
+            _participant(entry.destination, "110152", "Destination Role ID"),
+        ],
+        "AuditSourceIdentification": {"AuditSourceID": PROGRAM, "code": "4"},
+        "ParticipantObjectIdentification": [study] if entry.study else [],
+    }
+
+
+def _participant(name: str, code: str, meaning: str) -> dict[str, Any]:
+    role = {"csd-code": code, "codeSystemName": "DCM", "originalText": meaning}
+    return {"UserID": name, "UserIsRequestor": code == "110153", "RoleIDCode": role}
+
+
+def _last_hash(file: Any) -> str:
+    """Hash of the last whole line; what a killed process left of a line stays in the file and breaks nothing unseen."""
+    size = file.seek(0, os.SEEK_END)
+    if size == 0:
+        return GENESIS
+    span = 1 << 16
+    while True:
+        file.seek(max(0, size - span))
+        lines = file.read().splitlines()
+        if len(lines) > 1 or span >= size:
+            break
+        span *= 2
+    try:
+        return str(json.loads(lines[-1])["hash"])
+    except (ValueError, KeyError, TypeError):
+        return GENESIS

@@ -1,0 +1,105 @@
+"""An archive behind DICOMweb (PS3.18): QIDO-RS, WADO-RS, STOW-RS."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import requests
+from dicomweb_client import DICOMwebClient
+from pydicom import Dataset
+
+from service.adapters.dicom.objects import quiet
+from service.adapters.pacs.configuration import Archive
+from service.errors import ArchiveRefused, ArchiveUnavailable
+
+#: Answers after which the same request may succeed later.
+_PASSING = (408, 425, 429, 500, 502, 503, 504)
+
+
+class DicomWebArchive:
+    """The `PictureArchive` behind DICOMweb."""
+
+    def __init__(self, archive: Archive) -> None:
+        self._session = _Session(archive)
+        self._client = DICOMwebClient(archive.dicomweb or "", session=self._session)
+        self._client.set_http_retry_params(retry=False)
+
+    def images(self, study: str, series: str) -> list[Dataset]:
+        """Headers of a series; none when the archive does not have it."""
+        with _faults():
+            try:
+                found = self._client.retrieve_series_metadata(study, series)
+            except requests.HTTPError as error:
+                if error.response is not None and error.response.status_code == 404:
+                    return []
+                raise
+        with quiet():
+            return [Dataset.from_json(_without_bulk(item)) for item in found]
+
+    def store(self, objects: Sequence[Dataset]) -> None:
+        """Send objects of one study."""
+        with _faults(), quiet():
+            answer = self._client.store_instances(objects, study_instance_uid=str(objects[0].StudyInstanceUID))
+        if answer.get("FailedSOPSequence"):
+            raise ArchiveRefused("The archive did not take a result.")
+
+    def holds(self, objects: Sequence[Dataset]) -> bool:
+        """Whether a query finds every one of the objects."""
+        wanted: dict[tuple[str, str], set[str]] = {}
+        for found in objects:
+            wanted.setdefault((found.StudyInstanceUID, found.SeriesInstanceUID), set()).add(found.SOPInstanceUID)
+        return all(instances <= self._instances(*place) for place, instances in wanted.items())
+
+    def close(self) -> None:
+        """Let go of the connections."""
+        self._session.close()
+
+    def _instances(self, study: str, series: str) -> set[str]:
+        with _faults():
+            found = self._client.search_for_instances(study, series)
+        return {str(item["00080018"]["Value"][0]) for item in found}
+
+
+class _Session(requests.Session):
+    """A session with a time limit on each request and the archive's credentials."""
+
+    def __init__(self, archive: Archive) -> None:
+        super().__init__()
+        self._timeout_s = archive.timeout_s
+        if archive.authorization_file is not None:
+            self.headers["Authorization"] = archive.authorization_file.read_text(encoding="ascii").strip()
+        if archive.authorities is not None:
+            self.verify = str(archive.authorities)
+        if archive.tls is not None:
+            self.cert = (str(archive.tls.certificate), str(archive.tls.key))
+            self.verify = str(archive.tls.authorities)
+
+    def request(self, *arguments: Any, **options: Any) -> requests.Response:
+        """As its parent, but never without a time limit."""
+        return super().request(*arguments, **{"timeout": self._timeout_s, **options})
+
+
+class _faults:  # noqa: N801 - reads as a statement
+    """Failures of the network and the archive as errors of the project, without addresses."""
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        if isinstance(error, requests.HTTPError) and error.response is not None:
+            if error.response.status_code not in _PASSING:
+                status = error.response.status_code
+                raise ArchiveRefused(f"The archive refused a request with status {status}.") from None
+            raise ArchiveUnavailable("The archive cannot answer now.") from None
+        if isinstance(error, requests.RequestException | OSError):
+            raise ArchiveUnavailable("The archive cannot be reached.") from None
+
+
+def _without_bulk(item: Mapping[str, Any]) -> dict[str, Any]:
+    """The header's elements alone: bulk data are addresses, and no address is followed."""
+    kept = {}
+    for tag, element in item.items():
+        if "BulkDataURI" in element or tag.startswith("7FE0"):
+            continue
+        if element.get("vr") == "SQ":
+            element = {**element, "Value": [_without_bulk(inner or {}) for inner in element.get("Value", [])]}
+        kept[tag] = element
+    return kept

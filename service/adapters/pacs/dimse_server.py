@@ -1,0 +1,98 @@
+"""The DIMSE listener: C-ECHO, C-STORE of drawings, storage commitment, reports of commitment that was asked for.
+
+An object is acknowledged when it is on disk and in a durable job, never before.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from pydicom import Dataset
+from pynetdicom import AE, evt
+
+from service.adapters.dicom.objects import quiet
+from service.adapters.pacs import sop_classes
+from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome
+from service.adapters.pacs.configuration import Listener
+from service.adapters.pacs.dimse_client import commitment_key
+from service.adapters.pacs.tls import server_context
+from service.job_ports import BlobStore
+from service.pacs_ports import Disposition, ObjectReceiver
+
+#: Status of a C-STORE (PS3.4, GG.4-1).
+SUCCESS, CANNOT_UNDERSTAND, OUT_OF_RESOURCES, PROCESSING_FAILURE = 0x0000, 0xC000, 0xA700, 0x0110
+
+
+@contextmanager
+def dimse_listener(
+    listener: Listener, receiver: ObjectReceiver, blobs: BlobStore, audit: AuditTrail, log: Any
+) -> Iterator[None]:
+    """Accept associations while the context lasts."""
+    entity: Any = AE(ae_title=listener.ae_title)
+    entity.require_called_aet = True
+    entity.require_calling_aet = list(listener.calling_ae_titles)
+    entity.add_supported_context(sop_classes.VERIFICATION)
+    for uid in sop_classes.RECEIVED:
+        entity.add_supported_context(uid, list(sop_classes.ACCEPTED_SYNTAXES))
+    entity.add_supported_context(sop_classes.COMMITMENT, scu_role=True, scp_role=True)
+    desk = _Desk(listener, receiver, blobs, audit, log)
+    handlers: list[Any] = [
+        (evt.EVT_C_ECHO, lambda event: SUCCESS),
+        (evt.EVT_C_STORE, desk.store),
+        (evt.EVT_N_EVENT_REPORT, desk.report),
+        (evt.EVT_REJECTED, desk.rejected),
+    ]
+    context = None if listener.tls is None else server_context(listener.tls)
+    server = entity.start_server(
+        (listener.host, listener.port), block=False, ssl_context=context, evt_handlers=handlers
+    )
+    log.info("DICOM listener started", tls=context is not None)
+    try:
+        yield
+    finally:
+        server.shutdown()
+        log.info("DICOM listener stopped")
+
+
+class _Desk:
+    """What is done with what peers send."""
+
+    def __init__(
+        self, listener: Listener, receiver: ObjectReceiver, blobs: BlobStore, audit: AuditTrail, log: Any
+    ) -> None:
+        self._title = listener.ae_title
+        self._receiver = receiver
+        self._blobs = blobs
+        self._audit = audit
+        self._log = log
+
+    def store(self, event: Any) -> int:
+        """C-STORE: the status that the sender is told."""
+        sender = event.assoc.requestor.ae_title.strip()
+        try:
+            receipt = self._receiver.receive(event.encoded_dataset(), sender)
+        except OSError:
+            self._log.error("object cannot be kept")
+            return OUT_OF_RESOURCES
+        except Exception as fault:  # noqa: BLE001 - the sender must learn that it was not kept, whatever happened
+            self._log.error("object cannot be taken", fault=type(fault).__name__)
+            return PROCESSING_FAILURE
+        return CANNOT_UNDERSTAND if receipt.disposition is Disposition.QUARANTINED else SUCCESS
+
+    def report(self, event: Any) -> tuple[int, None]:
+        """N-EVENT-REPORT: what an archive says on the commitment that it was asked for."""
+        with quiet():
+            information: Dataset = event.event_information
+            key = commitment_key(str(information.TransactionUID))
+            failed = event.event_type != 1 or bool(information.get("FailedSOPSequence"))
+        self._blobs.put(key, b"failed" if failed else b"committed")
+        return SUCCESS, None
+
+    def rejected(self, event: Any) -> None:
+        """An association of somebody who is not on the list."""
+        caller = event.assoc.requestor.ae_title.strip()
+        note = "An association was rejected."
+        self._audit.write(
+            AuditEntry(AuditEvent.REFUSED, caller, self._title, outcome=Outcome.SERIOUS_FAILURE, note=note)
+        )
+        self._log.warning("association rejected")

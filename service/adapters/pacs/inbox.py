@@ -1,0 +1,98 @@
+"""What was received: on disk and in a durable job before anybody is told so; or in quarantine, with the reason.
+
+Files are named by digests: no name, number or date of a patient is in them.
+"""
+
+import hashlib
+import io
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from pydicom import Dataset
+
+from model.errors import InputError
+from service.adapters.dicom.objects import read_object, tolerant
+from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome
+from service.adapters.pacs.configuration import Rule
+from service.adapters.pacs.routing import Match, find_rule
+from service.job_ports import BlobStore, JobEngine
+from service.pacs_ports import DRAWING_JOB, Disposition, Receipt
+
+INBOX, QUARANTINE = "dicom/inbox", "dicom/quarantine"
+#: Files of one received object.
+OBJECT, IMAGES, REASON = "object.dcm", "images.json", "reason.json"
+
+
+@dataclass(frozen=True)
+class Inbox:
+    """The `ObjectReceiver`.
+
+    Attributes:
+        rules: in the order in which they are asked.
+        title: of this program in the audit trail.
+        log: takes events without identifiers.
+    """
+
+    rules: tuple[Rule, ...]
+    blobs: BlobStore
+    jobs: JobEngine
+    audit: AuditTrail
+    title: str
+    log: Any
+
+    def receive(self, data: bytes, sender: str) -> Receipt:
+        """Take one object; see `ObjectReceiver`."""
+        digest = hashlib.sha256(data).hexdigest()
+        try:
+            found = read_object(io.BytesIO(data), "object")
+            with tolerant("object"):
+                uids = str(found.SOPClassUID), str(found.SOPInstanceUID)
+                study = str(found.StudyInstanceUID)
+            match = find_rule(self.rules, found, sender)
+        except InputError as error:
+            return self._quarantine(data, digest, sender, error)
+        disposition = Disposition.LEFT_ALONE if match is None else Disposition.ACCEPTED
+        if match is not None:
+            self._accept(data, drawing_digest(found, match), match)
+        note = "" if match else "No rule takes it; it was left alone."
+        self.audit.write(AuditEntry(AuditEvent.RECEIVED, sender, self.title, study, [uids], note=note))
+        self.log.info("object received", disposition=disposition.value, rule=match.rule.name if match else None)
+        return Receipt(disposition, *uids)
+
+    def backlog(self) -> int:
+        """Objects that are accepted and not given back yet."""
+        return len({key.split("/")[2] for key in self.blobs.list(f"{INBOX}/")})
+
+    def quarantined(self) -> int:
+        """Objects in quarantine."""
+        return len({key.split("/")[2] for key in self.blobs.list(f"{QUARANTINE}/")})
+
+    def _accept(self, data: bytes, digest: str, match: Match) -> None:
+        identifier = self.jobs.new_id(DRAWING_JOB, digest)
+        labels = None if match.labels is None else sorted(match.labels)
+        argument = {"object": identifier, "rule": match.rule.name, "labels": labels}
+        self.blobs.put(f"{INBOX}/{identifier}/{OBJECT}", data)
+        status = self.jobs.enqueue(DRAWING_JOB, argument, identifier)
+        if status.state.is_final:  # sent once more after its results were given back
+            self.blobs.delete(f"{INBOX}/{identifier}/")
+
+    def _quarantine(self, data: bytes, digest: str, sender: str, error: InputError) -> Receipt:
+        quarantine(self.blobs, digest, data, str(error))
+        entry = AuditEntry(AuditEvent.RECEIVED, sender, self.title, outcome=Outcome.MINOR_FAILURE, note=str(error))
+        self.audit.write(entry)
+        self.log.warning("object quarantined", reason=str(error))
+        return Receipt(Disposition.QUARANTINED)
+
+
+def quarantine(blobs: BlobStore, name: str, data: bytes, reason: str) -> None:
+    """Put an object aside with the reason."""
+    blobs.put(f"{QUARANTINE}/{name}/{OBJECT}", data)
+    blobs.put(f"{QUARANTINE}/{name}/{REASON}", json.dumps({"reason": reason}).encode())
+
+
+def drawing_digest(found: Dataset, match: Match) -> str:
+    """The same for the same drawing, whichever way it comes and however often."""
+    with tolerant("object"):
+        content = found.to_json(bulk_data_threshold=1 << 62, suppress_invalid_tags=True)
+    return hashlib.sha256(f"{match.rule.name}\n{content}".encode()).hexdigest()

@@ -1,0 +1,30 @@
+"""The job of drawings, wired from the settings of a worker."""
+
+from functools import partial
+from pathlib import Path
+
+from service.adapters.image_guard import ImageLimits
+from service.adapters.pacs.archives import open_archive
+from service.adapters.pacs.configuration import load_configuration
+from service.adapters.pacs.delivery import Desk
+from service.app import program_version
+from service.job_ports import BlobStore, JobKind
+from service.jobs.drawings import DrawingTools, drawing_kind
+from service.observability import Log
+from service.pacs import audit_trail, silence_libraries, title_of
+from service.ports import Catalogue
+from service.settings import Settings
+
+
+def pacs_kinds(settings: Settings, file: Path, registry: Catalogue, blobs: BlobStore, log: Log) -> tuple[JobKind, ...]:
+    """The kinds of jobs of a worker among archives.
+
+    Raises:
+        InvalidParameter: the file cannot be used.
+    """
+    silence_libraries()
+    configuration = load_configuration(file)
+    audit = audit_trail(configuration, settings)
+    desk = Desk(configuration, blobs, audit, partial(open_archive, blobs=blobs), title_of(configuration))
+    limits = ImageLimits(max_bytes=settings.max_body_bytes, max_voxels=settings.max_voxels)
+    return (drawing_kind(DrawingTools(desk, registry, limits, program_version(), log)),)

@@ -1,0 +1,140 @@
+"""``POST /dicom-web/studies``: DICOM objects that an archive forwards (STOW-RS; PS3.18, 10.5)."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.concurrency import run_in_threadpool
+from python_multipart.exceptions import MultipartParseError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.responses import JSONResponse, Response
+
+from model.errors import NotFound
+from service.errors import UnsupportedMediaType
+from service.pacs_ports import Disposition, ObjectReceiver, Receipt
+from service.routes.responses import problems
+
+PATH = "/dicom-web/studies"
+MEDIA_TYPE = "application/dicom+json"
+#: Who sent what came this way, in rules and in the audit trail.
+SENDER = "STOW-RS"
+#: Failure reason of an object that cannot be understood (PS3.18, table I.2-1).
+CANNOT_UNDERSTAND, PROCESSING_FAILURE = 0xC000, 0x0110
+
+
+def receiver_of(request: Request) -> ObjectReceiver:
+    """The receiver of objects; `NotFound` where no file says how the service stands among archives."""
+    inbox: ObjectReceiver | None = getattr(request.app.state.pacs, "inbox", None)
+    if inbox is None:
+        raise NotFound("This service takes no DICOM objects; MORPHOFLOW_PACS_FILE is not set.")
+    return inbox
+
+
+def boundary_of(request: Request) -> bytes:
+    """What separates the parts; `UnsupportedMediaType` for other bodies."""
+    media, options = parse_options_header(request.headers.get("content-type", ""))
+    kind = options.get(b"type", b"application/dicom").lower()
+    boundary = options.get(b"boundary")
+    if media != b"multipart/related" or kind != b"application/dicom" or not boundary:
+        raise UnsupportedMediaType(
+            'The request\'s body must be multipart/related with type="application/dicom" and a boundary.'
+        )
+    return boundary
+
+
+def stow_router() -> APIRouter:
+    """Both forms of the route."""
+    router = APIRouter(tags=["DICOM"])
+    shared: dict[str, Any] = {
+        "methods": ["POST"],
+        "response_class": Response,
+        "openapi_extra": {
+            "requestBody": {
+                "required": True,
+                "content": {'multipart/related; type="application/dicom"': {"schema": {"type": "string"}}},
+            }
+        },
+        "responses": {
+            200: {"description": "all were taken", "content": {MEDIA_TYPE: {"schema": {"type": "object"}}}},
+            202: {"description": "some were taken", "content": {MEDIA_TYPE: {"schema": {"type": "object"}}}},
+            409: {"description": "none was taken", "content": {MEDIA_TYPE: {"schema": {"type": "object"}}}},
+            **problems(400, 404, 413, 415),
+        },
+    }
+    router.add_api_route(PATH, store_instances, summary="Take DICOM objects (STOW-RS)", **shared)
+    router.add_api_route(PATH + "/{study}", store_study_instances, summary="Take DICOM objects of one study", **shared)
+    return router
+
+
+async def store_instances(
+    request: Request,
+    receiver: Annotated[ObjectReceiver, Depends(receiver_of)],
+    boundary: Annotated[bytes, Depends(boundary_of)],
+) -> Response:
+    """Keeps each object on disk and in a durable job before it is acknowledged.
+
+    What no rule takes is acknowledged and left alone.
+    """
+    objects = await parts_of(request, boundary)
+    receipts = [await run_in_threadpool(_receive, receiver, found) for found in objects]
+    taken = [r for r in receipts if r.disposition in (Disposition.ACCEPTED, Disposition.LEFT_ALONE)]
+    status = 200 if len(taken) == len(receipts) > 0 else 202 if taken else 409
+    return JSONResponse(response_module(receipts), status, media_type=MEDIA_TYPE)
+
+
+async def store_study_instances(
+    request: Request,
+    study: str,  # noqa: ARG001 - objects carry their study themselves
+    receiver: Annotated[ObjectReceiver, Depends(receiver_of)],
+    boundary: Annotated[bytes, Depends(boundary_of)],
+) -> Response:
+    """As without a study in the path; the objects say themselves which study they are of."""
+    return await store_instances(request, receiver, boundary)
+
+
+async def parts_of(request: Request, boundary: bytes) -> list[bytes]:
+    """Bodies of the parts.
+
+    Raises:
+        UnsupportedMediaType: the body is not complete.
+    """
+    parts: list[bytearray] = []
+    ended: list[bool] = []
+    callbacks: Any = {
+        "on_part_begin": lambda: parts.append(bytearray()),
+        "on_part_data": lambda data, start, end: parts[-1].extend(data[start:end]),
+        "on_end": lambda: ended.append(True),
+    }
+    try:
+        parser = MultipartParser(boundary, callbacks)
+        async for chunk in request.stream():
+            parser.write(chunk)
+        parser.finalize()
+    except MultipartParseError:
+        ended.clear()
+    if not ended:
+        raise UnsupportedMediaType("The request's body must be complete multipart/related with one object a part.")
+    return [bytes(part) for part in parts]
+
+
+def response_module(receipts: list[Receipt]) -> dict[str, Any]:
+    """The store instances response module (PS3.18, table 10.5.3-1) in the DICOM JSON model."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for receipt in receipts:
+        item = {
+            "00081150": {"vr": "UI", "Value": [receipt.sop_class]},
+            "00081155": {"vr": "UI", "Value": [receipt.sop_instance]},
+        }
+        reason = {Disposition.QUARANTINED: CANNOT_UNDERSTAND, Disposition.FAILED: PROCESSING_FAILURE}
+        failed = reason.get(receipt.disposition)
+        if failed is None:
+            groups.setdefault("00081199", []).append(item)
+        else:
+            groups.setdefault("00081198", []).append({**item, "00081197": {"vr": "US", "Value": [failed]}})
+    return {tag: {"vr": "SQ", "Value": items} for tag, items in groups.items()}
+
+
+def _receive(receiver: ObjectReceiver, data: bytes) -> Receipt:
+    try:
+        return receiver.receive(data, SENDER)
+    except OSError:
+        return Receipt(Disposition.FAILED)
