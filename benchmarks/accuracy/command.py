@@ -55,8 +55,9 @@ def main(
     with exit_status():
         bundles = bundles_of(model or [])
         chosen = cohort or [name for name in CohortName if name in bundles]
-        plans = [_plan(name, bundles, data, cache, cases, adam_cases, threads) for name in chosen]
         wanted = available(methods or [method for method in MethodName if method is not MethodName.ADAM])
+        learned = cache if MethodName.PCA in wanted else None
+        plans = [_plan(name, bundles, data, learned, cases, adam_cases, threads) for name in chosen]
         tasks = tasks_of(plans, regimes or list(DrawingName), wanted, tag)
         faults = _measure(tasks, CellFile(output / "cells.jsonl"), jobs)
         cells = _report(tasks, CellFile(output / "cells.jsonl"), output)
@@ -96,7 +97,7 @@ def _plan(
     name: CohortName,
     bundles: dict[str, Path],
     data: Path | None,
-    cache: Path,
+    cache: Path | None,
     cases: int,
     adam_cases: int,
     threads: int,
@@ -105,7 +106,7 @@ def _plan(
         raise InvalidParameter(f"There is no model of {name}; --model {name}=BUNDLE names one.", part="model")
     found = load_cohort(name, data_folder(data), CohortOptions(skip_refused=True))
     typer.echo(f"{name}: {min(cases, len(found.test))} of {len(found.test)} test cases", err=True)
-    sources = Sources(bundles[name], kept(found, cache), threads)
+    sources = Sources(bundles[name], kept(found, cache) if cache is not None else None, threads)
     manifest, _ = read_manifest(bundles[name])
     shippable = found.provenance.shippable and bool(manifest.training.get("weights_may_ship"))
     return CohortPlan(name.value, chosen_cases(found.test, cases), adam_cases, sources, shippable, found.attribution)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from benchmarks.accuracy.names import MethodName
+from model.errors import InvalidParameter
 from model.geometry import Grid
 from model.inference.reconstruction import Options
 from training.oblique import SliceStacks
@@ -27,10 +28,15 @@ Fill = Callable[[SliceStacks, Grid], Filled]
 
 @dataclass(frozen=True)
 class Sources:
-    """Where learned methods find what they learned, and the threads that any method may use."""
+    """Where learned methods find what they learned, and the threads that any method may use.
+
+    Attributes:
+        bundle: folder of the shape model.
+        modes: file of the PCA's modes; None when that method is not measured.
+    """
 
     bundle: Path
-    modes: Path
+    modes: Path | None
     threads: int = 1
 
 
@@ -101,7 +107,7 @@ def modes_fill(sources: Sources) -> Fill:
     from training.baselines.distance_fit import filled, fit_modes
     from training.baselines.kept_modes import read_chosen
 
-    chosen = read_chosen(sources.modes)
+    chosen = read_chosen(_needed(sources.modes))
 
     def fill(drawing: SliceStacks, grid: Grid) -> Filled:
         begin = time.perf_counter()
@@ -110,6 +116,12 @@ def modes_fill(sources: Sources) -> Fill:
         return Filled(filled(chosen.modes, found, grid), fit_s)
 
     return fill
+
+
+def _needed(modes: Path | None) -> Path:
+    if modes is None:
+        raise InvalidParameter("PCA was asked for without its modes; their file is accepted.", part="modes")
+    return modes
 
 
 def signed_distance_fill() -> Fill:

@@ -77,7 +77,9 @@ def learned_digest(method: MethodName, sources: Sources) -> str:
     """Digest of what a method has learned; empty for methods that learn nothing."""
     if method in INTERPOLATIONS:
         return ""
-    return (digest_of(sources.modes) if method is MethodName.PCA else bundle_digest(sources.bundle))[:16]
+    if method is MethodName.PCA:
+        return digest_of(sources.modes)[:16] if sources.modes else ""
+    return bundle_digest(sources.bundle)[:16]
 
 
 def bundle_digest(folder: Path) -> str:

@@ -1,0 +1,1 @@
+"""The service beside a real archive (Orthanc): the scene, and many studies at once."""

@@ -1,0 +1,147 @@
+"""Orthanc with its DICOMweb plugin (Debian: orthanc, orthanc-dicomweb) on free ports of this machine."""
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+TITLE = "ORTHANC"
+PLUGIN = Path("/usr/share/orthanc/plugins/libOrthancDicomWeb.so")
+START_LIMIT_S, STOP_LIMIT_S = 60.0, 30.0
+#: Forwards drawings, but not results, to the service.
+FORWARD = """
+function OnStoredInstance(id, tags, metadata, origin)
+  local drawing = tags['Modality'] == 'SEG' or tags['Modality'] == 'RTSTRUCT'
+  if drawing and tags['Manufacturer'] ~= 'MorphoFlow' then
+    %s
+  end
+end
+"""
+BY_DIMSE = "SendToModality(id, 'morphoflow')"
+BY_DICOMWEB = """RestApiPost('/dicom-web/servers/morphoflow/stow', '{"Resources":["' .. id .. '"]}', false)"""
+
+
+@dataclass(frozen=True)
+class Orthanc:
+    """A running archive: its REST interface and its ports."""
+
+    client: httpx.Client
+    http_port: int
+    dicom_port: int
+
+    @property
+    def dicomweb(self) -> str:
+        """Base address of its DICOMweb services."""
+        return f"http://127.0.0.1:{self.http_port}/dicom-web"
+
+    def instances(self, study: str | None = None) -> list[dict[str, str]]:
+        """Main tags of every instance, of one study if it is named."""
+        query: dict[str, Any] = {"Level": "Instance", "Expand": True, "Query": {"StudyInstanceUID": study or "*"}}
+        query["RequestedTags"] = []
+        found = self.client.post("/tools/find", json=query).raise_for_status().json()
+        return [{**item["MainDicomTags"], "ID": item["ID"], "ParentSeries": item["ParentSeries"]} for item in found]
+
+    def series(self) -> list[dict[str, str]]:
+        """Main tags of every series, with the number of its instances."""
+        found = self.client.get("/series", params={"expand": ""}).raise_for_status().json()
+        return [{**item["MainDicomTags"], "ID": item["ID"], "Instances": str(len(item["Instances"]))} for item in found]
+
+    def file(self, identifier: str) -> bytes:
+        """An instance as a DICOM file."""
+        return self.client.get(f"/instances/{identifier}/file").raise_for_status().content
+
+
+def is_installed() -> bool:
+    """Whether Orthanc, its plugin and storescu are there."""
+    return all(map(shutil.which, ("Orthanc", "storescu"))) and PLUGIN.exists()
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports that nothing listens on."""
+    probes = [socket.socket() for _ in range(count)]
+    for probe in probes:
+        probe.bind(("127.0.0.1", 0))
+    ports = [int(probe.getsockname()[1]) for probe in probes]
+    for probe in probes:
+        probe.close()
+    return ports
+
+
+@contextmanager
+def running_orthanc(
+    folder: Path, ports: tuple[int, int], service_dicom_port: int, service_http_port: int, forward: str = BY_DIMSE
+) -> Iterator[Orthanc]:
+    """The archive while the context lasts; what it keeps stays in the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    script = folder / "forward.lua"
+    script.write_text(FORWARD % forward)
+    settings = folder / "orthanc.json"
+    settings.write_text(json.dumps(_settings(folder, ports, service_dicom_port, service_http_port, script)))
+    with (folder / "orthanc.log").open("ab") as log:
+        process = subprocess.Popen([shutil.which("Orthanc") or "Orthanc", settings], stdout=log, stderr=log)
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{ports[0]}", timeout=60.0) as client:
+            _wait_until_ready(client, process)
+            yield Orthanc(client, *ports)
+    finally:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(STOP_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _settings(
+    folder: Path, ports: tuple[int, int], service_dicom_port: int, service_http_port: int, script: Path
+) -> dict[str, Any]:
+    service = f"http://127.0.0.1:{service_http_port}/dicom-web/"
+    return {
+        "Name": "Scene",
+        "StorageDirectory": str(folder / "storage"),
+        "IndexDirectory": str(folder / "storage"),
+        "HttpPort": ports[0],
+        "DicomPort": ports[1],
+        "DicomAet": TITLE,
+        "RemoteAccessAllowed": False,
+        "AuthenticationEnabled": False,
+        "DicomAlwaysAllowGet": True,
+        "DicomAlwaysAllowStore": True,
+        "OverwriteInstances": False,
+        "DicomModalities": {
+            "morphoflow": ["MORPHOFLOW", "127.0.0.1", service_dicom_port],
+            "move": ["MORPHOMOVE", "127.0.0.1", service_dicom_port + 1],
+        },
+        "Plugins": [str(PLUGIN)],
+        "DicomWeb": {"Enable": True, "Root": "/dicom-web/", "Servers": {"morphoflow": [service]}},
+        "LuaScripts": [str(script)],
+        "ConcurrentJobs": 4,
+    }
+
+
+def _wait_until_ready(client: httpx.Client, process: subprocess.Popen[bytes]) -> None:
+    limit = time.monotonic() + START_LIMIT_S
+    while time.monotonic() < limit and process.poll() is None:
+        try:
+            if client.get("/system").is_success:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.05)
+    raise SystemExit("Orthanc did not become ready; its log stands beside its storage.")
+
+
+def send(files: list[Path] | Path, port: int, title: str = TITLE, caller: str = "SCENE") -> None:
+    """Send files, or all files of a folder, with dcmtk's storescu."""
+    what = ["+sd", str(files)] if isinstance(files, Path) else [str(file) for file in files]
+    command = [shutil.which("storescu") or "storescu", "-aec", title, "-aet", caller, "127.0.0.1", str(port)]
+    subprocess.run([*command, *what], check=True, capture_output=True)
