@@ -45,8 +45,8 @@ class Orthanc:
 
     def instances(self, study: str | None = None) -> list[dict[str, str]]:
         """Main tags of every instance, of one study if it is named."""
-        query: dict[str, Any] = {"Level": "Instance", "Expand": True, "Query": {"StudyInstanceUID": study or "*"}}
-        query["RequestedTags"] = []
+        wanted = {} if study is None else {"StudyInstanceUID": study}
+        query: dict[str, Any] = {"Level": "Instance", "Expand": True, "Query": wanted}
         found = self.client.post("/tools/find", json=query).raise_for_status().json()
         return [{**item["MainDicomTags"], "ID": item["ID"], "ParentSeries": item["ParentSeries"]} for item in found]
 

@@ -7,7 +7,13 @@ from pydicom import Dataset
 
 from model.errors import InvalidGeometry
 from model.geometry import Grid
+from service.adapters.dicom.objects import quiet
 from service.adapters.dicom.planes import FramePlane, frame_planes, parallel_groups, stack_grid
+
+
+#: Elements of patient and study that every image has to have, if without a value (type 2; PS3.3, C.7.1.1 and C.7.2.1).
+COMMON = ("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "AccessionNumber")
+COMMON += ("StudyID", "StudyDate", "StudyTime", "ReferringPhysicianName")
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,7 @@ def series_of(images: Sequence[Dataset], part: str = "series") -> Series:
     """
     if not images:
         raise InvalidGeometry(f"The {part} has no images; those that were drawn on are needed", part=part)
-    found = [(image, frame_planes(image, part)) for image in images]
+    found = [(completed(image), frame_planes(image, part)) for image in images]
     first = found[0][1][0]
     found.sort(key=lambda item: float(first.offset(item[1][0])[2]))
     planes = [plane for _, own in found for plane in own]
@@ -46,3 +52,12 @@ def series_of(images: Sequence[Dataset], part: str = "series") -> Series:
             f"The {part} is no regular stack of planes; parallel ones at equal distances are accepted", part=part
         )
     return Series(tuple(image for image, _ in found), tuple(planes), grid, tuple(int(place) for place in places))
+
+
+def completed(image: Dataset) -> Dataset:
+    """The image with every element that those derived from it must carry over, empty where it has none."""
+    with quiet():
+        for name in COMMON:
+            if name not in image:
+                setattr(image, name, None)
+    return image
