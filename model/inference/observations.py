@@ -6,7 +6,7 @@ observations: a world point, an occupancy label and a weight.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,7 +22,7 @@ from model.inference.plane_sampling import (
     systematic_sample,
 )
 
-__all__ = ["AnnotatedRule", "MaskStack", "Observations", "Plane", "find_planes", "observe"]
+__all__ = ["AnnotatedRule", "MaskStack", "Observations", "Plane", "find_planes", "observe", "thinned"]
 
 #: Index ranges of a part of a grid.
 Window = tuple[slice, slice, slice]
@@ -119,6 +119,25 @@ def observe(stacks: Sequence[MaskStack], planes: Sequence[Plane], *, budget: int
     drawn = candidates.at(rows)
     points = _world_points(stacks, planes, drawn)
     return Observations(points, drawn.label.astype(float), weights * step, tuple(planes), drawn.plane_of)
+
+
+def thinned(observations: Observations, every: int, *, seed: int) -> Observations:
+    """One observation of every so many neighbours in the list, which stands for all of them.
+
+    Weighted sums stay unbiased: in each block of `every` rows one is drawn with equal chances.
+    """
+    if every <= 1:
+        return observations
+    starts = np.arange(0, len(observations.points), every)
+    sizes = np.minimum(every, len(observations.points) - starts)
+    rows = starts + np.random.default_rng(seed).integers(sizes)
+    return replace(
+        observations,
+        points=observations.points[rows],
+        labels=observations.labels[rows],
+        weights=observations.weights[rows] * sizes,
+        plane_of=observations.plane_of[rows],
+    )
 
 
 def _plane_step(planes: Sequence[Plane], windows: Sequence[Window]) -> int:

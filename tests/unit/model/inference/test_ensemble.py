@@ -84,7 +84,7 @@ def test_uncertain_where_the_planes_disagree():
     spreads = []
     for each in (stack, replace(stack, foreground=foreground)):
         observations = observed(each, PARALLEL)
-        found = fit(MODEL, observations, FitOptions())
+        found = fit(MODEL, observations, FitOptions(robust=False))
         ensemble = fit_ensemble(MODEL, observations, found, seed=0)
         spreads.append(np.std([member.pose.position[0] for member in ensemble]))
     assert spreads[1] > 5.0 * spreads[0]
@@ -111,4 +111,12 @@ def test_starts_are_spread_by_half_a_prior_standard_deviation():
 
 def test_planes_without_observations_are_no_obstacle():
     wider = replace(OBSERVATIONS, planes=(*ORTHOGONAL, *PARALLEL))
-    assert len(fit_ensemble(MODEL, wider, FOUND, seed=0, members=2)) == 2
+    found = replace(FOUND, plane_weights=None)
+    assert len(fit_ensemble(MODEL, wider, found, seed=0, members=2)) == 2
+
+
+def test_planes_that_the_fit_left_out_stay_out():
+    found = replace(FOUND, plane_weights=np.array([1.0, 0.0, 1.0]))
+    without = replace(OBSERVATIONS, labels=np.where(OBSERVATIONS.plane_of == 1, 0.0, OBSERVATIONS.labels))
+    members = [fit_ensemble(MODEL, each, found, seed=0, members=2) for each in (OBSERVATIONS, without)]
+    assert all(same(a, b) for a, b in zip(*members, strict=True))

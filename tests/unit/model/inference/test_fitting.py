@@ -14,12 +14,12 @@ from model.inference.fitting import (
     Fit,
     FitOptions,
     FitStatus,
-    _Objective,
     fit,
     fit_from,
     pose_offset,
     starting_poses,
 )
+from model.inference.objective import Objective
 from model.inference.observations import Observations, Plane
 from model.inference.posterior import fitted_logits
 from tests.analytic_model import (
@@ -179,7 +179,7 @@ def random_case(seed, *, mirrored=False):
         np.zeros(count, int),
     )
     start = Pose(CENTRE + rng.normal(size=3), rotation(15.0, (1.0, 2.0, -1.0)), 0.02, mirrored)
-    objective = _Objective(model, observations, start, FitOptions())
+    objective = Objective(model, observations, start, FitOptions())
     pose = start.moved(rng.normal(size=POSE_SIZE) * np.array([2.0] * 3 + [0.3] * 3 + [0.05]))
     return objective, rng.normal(size=3), pose
 
@@ -209,7 +209,7 @@ def test_curvature_is_the_hessian_where_the_labels_are_as_expected():
     logits = model.decoder.logits(latent[None], pose.to_canonical(points)[None])[0]
     labels = 1.0 / (1.0 + np.exp(-logits))
     observations = Observations(points, labels, rng.uniform(0.1, 2.0, 300), ORTHOGONAL, np.zeros(300, int))
-    objective = _Objective(model, observations, pose, FitOptions())
+    objective = Objective(model, observations, pose, FitOptions())
     steps = 1e-5 * np.eye(3 + POSE_SIZE)
     slopes = [
         objective.at(latent + s[:3], pose.moved(s[3:])).gradient
@@ -224,7 +224,7 @@ def test_precision_and_gradient_at_the_optimum():
     observations = observations_of(Ellipsoid((14.0, 8.0, 6.0), CENTRE))
     found = fit(MODEL, observations, FitOptions(tolerance=1e-8))
     start = starting_poses(observations, FitOptions())[0]
-    point = _Objective(MODEL, observations, start, FitOptions()).at(found.latent, found.pose)
+    point = Objective(MODEL, observations, start, FitOptions()).at(found.latent, found.pose)
     assert point.value == found.objective
     assert np.abs(np.linalg.solve(found.precision, point.gradient)).max() < 1e-3
     np.testing.assert_allclose(found.precision, found.precision.T, atol=1e-9 * np.abs(found.precision).max())

@@ -1,5 +1,6 @@
 """Annotated planes and weighted observations."""
 
+from dataclasses import replace
 from itertools import permutations, product
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from model.errors import InconsistentStacks, InvalidMask, InvalidParameter
 from model.geometry import Grid
-from model.inference.observations import COVER_MARGIN_MM, MaskStack, Plane, find_planes, observe
+from model.inference.observations import COVER_MARGIN_MM, MaskStack, Plane, find_planes, observe, thinned
 from model.inference.plane_sampling import (
     band_width,
     contour_distance,
@@ -409,3 +410,16 @@ def test_distance_of_a_disc_is_that_of_its_contour():
 )
 def test_band_width_follows_the_voxel(spacing, width):
     assert band_width(np.array(spacing)) == pytest.approx(width)
+
+
+@pytest.mark.parametrize("every", [1, 2, 4, 7])
+def test_thinning_keeps_weighted_sums_on_average(every):
+    stack = stack_of(ellipsoid())
+    observations = observe([stack], find_planes([stack], (Plane(0, 2, 8), Plane(0, 0, 14))), budget=600, seed=0)
+    value = observations.labels * (2.0 + observations.points[:, 0])
+    sums = []
+    for seed in range(200):
+        few = thinned(replace(observations, labels=value), every, seed=seed)
+        sums.append(few.weights @ few.labels)
+    assert len(few.points) == -(-len(value) // every)
+    assert np.mean(sums) == pytest.approx(observations.weights @ value, rel=0.02)

@@ -11,7 +11,7 @@ from scipy.special import expit
 from scipy.stats import norm
 
 from model.geometry import POSE_SIZE, Pose
-from model.inference.fitting import Fit, FitOptions, FitStatus, _Objective, fit, starting_poses
+from model.inference.fitting import Fit, FitOptions, FitStatus, fit, starting_poses
 from model.inference.posterior import (
     CHUNK,
     fitted_jacobians,
@@ -80,7 +80,7 @@ def test_laplace_is_close_to_the_posterior():
     model = ellipsoid_model()
     observations = observed(drawn(Ellipsoid((14.0, 9.0, 5.5), CENTRE), cube_around(CENTRE)))
     found = fit(model, observations, FitOptions(tolerance=1e-6))
-    objective = _Objective(model, observations, starting_poses(observations, FitOptions())[0], FitOptions())
+    objective = Objective(model, observations, starting_poses(observations, FitOptions())[0], FitOptions())
     covariance = laplace_covariance(found)
     draws = parameter_draws(covariance, 600, seed=1)
     exact = np.array([objective.at(found.latent + d[:3], found.pose.moved(d[3:])).value for d in draws])

@@ -1,0 +1,80 @@
+"""What is asked of the solver and what it answers."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from model.geometry import Pose
+
+MirrorRule = Literal["auto", "never", "always"]
+
+
+class FitStatus(StrEnum):
+    """Why the solver stopped."""
+
+    CONVERGED = "converged"
+    STALLED = "stalled"
+    ITERATION_LIMIT = "iteration_limit"
+
+    @property
+    def sentence(self) -> str:
+        """The same as a sentence."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    FitStatus.CONVERGED: "The fit converged: the last step was below the tolerance.",
+    FitStatus.STALLED: "The fit stopped because no damped step lowered the objective further.",
+    FitStatus.ITERATION_LIMIT: "The fit reached its limit of iterations before it converged.",
+}
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Settings of the solver.
+
+    Attributes:
+        mirror: whether left and right may be exchanged.
+        any_orientation: whether half turns about the canonical axes are tried too, for drawings whose axes are unknown.
+        robust: whether planes that contradict all others are left out.
+        position_sd_mm, rotation_sd, log_scale_sd: pose prior around the starting pose; rotation in rad.
+        max_iterations: Levenberg-Marquardt iterations of one start.
+        tolerance: converged when the predicted decrease of the objective is below it (nats).
+    """
+
+    mirror: MirrorRule = "never"
+    any_orientation: bool = False
+    robust: bool = True
+    position_sd_mm: float = 20.0
+    rotation_sd: float = 0.15
+    log_scale_sd: float = 0.02
+    max_iterations: int = 40
+    tolerance: float = 1e-2
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What the solver found.
+
+    Attributes:
+        latent: (d,) latent code at the optimum.
+        pose: world to canonical.
+        status: why it stopped; `message` is the same as a sentence.
+        iterations: Levenberg-Marquardt iterations of the chosen start, all stages.
+        objective: negative log posterior at the optimum (nats).
+        precision: (d + 7, d + 7) curvature of the objective over (latent, pose step).
+        plane_weights: (k,) trust in each annotated plane: 0 for one that contradicts the others and was left out of
+            the fit, else 1; None when that was not looked into.
+    """
+
+    latent: Float[np.ndarray, "d"]
+    pose: Pose
+    status: FitStatus
+    message: str
+    iterations: int
+    objective: float
+    precision: Float[np.ndarray, "p p"]
+    plane_weights: Float[np.ndarray, "k"] | None = None
