@@ -1,31 +1,33 @@
 """The zero surface of a scalar field as a closed mesh; knows no network.
 
-Coarse-to-fine evaluation (`model.inference.refinement`), marching cubes on the dense grid (Lewiner et al.,
-Efficient implementation of marching cubes' cases with topological guarantees, 2003), and a Newton step of
-the vertices along the field's gradient when there is one.
+Coarse-to-fine evaluation (`model.inference.refinement`), marching cubes in the cells through which the surface runs
+(`model.inference.polygons`), and a Newton step of each vertex along its edge of the grid when there is a gradient.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
-from skimage import measure
+from jaxtyping import Float
 
 from model.inference.mesh import Mesh, empty_mesh, is_watertight, largest_component, mesh_of, unit
-from model.inference.refinement import Refinement, mixed_cells
+from model.inference.polygons import INTERIOR, Polygons, checkered_nodes, polygons_of
+from model.inference.refinement import Refinement
 
 #: Positive inside, negative outside; points in mm.
 Field = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
 #: Values and their gradient (per mm).
 FieldWithGradient = Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]]
 
-#: Node values this close to zero, in shares of the typical value beside the surface, count as that
-#: far away: a vertex exactly on a node would make degenerate faces.
-NODE_CLEARANCE = 1e-3
-#: The coarsest grid has at least this many cells along each axis, so that no limb of an object is lost.
-COARSE_CELLS = 12
+#: The coarsest grid has at least this many cells along each axis.
+COARSE_CELLS = 6
+FACTORS = (2, 4, 8, 16, 32)
+#: Value of a node whose sign had to change.
+RAISED = 1e-30
+#: Vertices keep this share of an edge away from its ends.
+EDGE_MARGIN = 1e-4
+NEAR_END = 0.05
+NEWTON_STEPS = 10
 
 
 def extract_surface(
@@ -36,13 +38,16 @@ def extract_surface(
     *,
     coarse_factor: int | None = None,
     gradient: FieldWithGradient | None = None,
+    steepest: float | None = None,
     keep_specks: bool = False,
 ) -> Mesh:
     """The closed surface where a field is zero, inside a box.
 
-    Watertight, two-manifold and oriented outwards. Where the object reaches the border of the box it
-    is capped there (half a step outside). Without `gradient` the vertices are second order accurate in the
-    step, with it fourth order.
+    Watertight, two-manifold, oriented outwards, without self-intersections: each vertex stays on its own edge of the
+    grid, at most one on an edge. Where the object reaches the border of the box it is capped there (half a step
+    outside). Without `gradient` the vertices are second order accurate in the step, with it fourth order. Memory and
+    evaluations grow with the surface, not with the box; which parts could be missed is told in
+    `model.inference.refinement`.
 
     Args:
         field: values at points (mm), positive inside.
@@ -50,6 +55,7 @@ def extract_surface(
         step_mm: distance of the finest nodes.
         coarse_factor: coarsest step in finest steps, a power of two; by the size of the box when None.
         gradient: values and gradients at points; moves the vertices onto the surface and gives the normals.
+        steepest: bound of the field's slope (1/mm) that the caller vouches for; none is needed.
         keep_specks: keep all components; only the one of largest volume otherwise (`largest_component`
             counts those that go).
 
@@ -59,16 +65,15 @@ def extract_surface(
     Raises:
         InvalidParameter: a step, box or factor that no grid can have.
     """
-    refinement = Refinement(lower, upper, step_mm, coarse_factor or _coarse_factor(lower, upper, step_mm))
-    while len(points := refinement.query()):
-        refinement.update(field(points))
-    mesh = polygonise(refinement.grid(), lower, step_mm)
-    if not keep_specks:
-        mesh, _ = largest_component(mesh)
-    if gradient is None or mesh.is_empty:
-        return mesh
-    reach = refinement.grid().shape
-    return _settled(mesh, gradient, lower, lower + (np.array(reach) - 1) * step_mm, step_mm)
+    factor = coarse_factor or _coarse_factor(lower, upper, step_mm)
+    refinement = Refinement(lower, upper, step_mm, factor, steepest)
+    polygons = _polygons(refinement, lambda: field(refinement.query()))
+    if polygons is None:
+        return empty_mesh()
+    mesh = mesh_of(lower + step_mm * polygons.places, polygons.faces)
+    if gradient is not None:
+        mesh = _settled(mesh, gradient, polygons, refinement, step_mm)
+    return mesh if keep_specks else largest_component(mesh)[0]
 
 
 def polygonise(values: Float[np.ndarray, "i j k"], lower: Float[np.ndarray, "3"], step_mm: float) -> Mesh:
@@ -77,85 +82,102 @@ def polygonise(values: Float[np.ndarray, "i j k"], lower: Float[np.ndarray, "3"]
     Args:
         values: at nodes ``lower + step_mm * (i, j, k)``.
     """
-    inside = values > 0
-    if not inside.any():
-        return empty_mesh()
-    first, last = _bounds(inside)
-    crop = values[tuple(slice(a, b) for a, b in zip(first, last, strict=True))]
-    padded = np.pad(_cleared(crop), 1, mode="edge")
-    for axis in range(3):
-        border = np.moveaxis(padded, axis, 0)
-        border[[0, -1]] = -np.abs(border[[0, -1]])
-    origin = np.asarray(lower, float) + (first - 1) * step_mm
-    mesh = _marching_cubes(padded, origin, step_mm)
-    if not is_watertight(mesh):
-        _bridge(padded)
-        mesh = _marching_cubes(padded, origin, step_mm)
-    return mesh
+    upper = lower + step_mm * (np.array(values.shape) - 1)
+    refinement = Refinement(lower, upper, step_mm, 1)
+    polygons = _polygons(refinement, lambda: values[tuple(refinement.wanted().T)])
+    return empty_mesh() if polygons is None else mesh_of(lower + step_mm * polygons.places, polygons.faces)
 
 
-def _marching_cubes(values: Float[np.ndarray, "i j k"], origin: Float[np.ndarray, "3"], step_mm: float) -> Mesh:
-    marching_cubes: Any = measure.marching_cubes
-    corners, faces, _, _ = marching_cubes(values, 0.0, method="lewiner", gradient_direction="ascent")
-    return mesh_of(origin + corners.astype(float) * step_mm, faces.astype(np.int64))
+def _polygons(refinement: Refinement, evaluate: Callable[[], Float[np.ndarray, "n"]]) -> Polygons | None:
+    """Polygons of the finest grid, its values changed where they would not be two-manifold; None where it is empty.
+
+    Args:
+        evaluate: values at the points that the refinement wants.
+    """
+    _complete(refinement, evaluate)
+    cells, values = refinement.crossed()
+    if not len(cells):
+        return None
+    polygons = polygons_of(cells, values)
+    if is_watertight(Mesh(polygons.places, polygons.faces, polygons.places)):
+        return polygons
+    while len(nodes := checkered_nodes(cells, values)):
+        refinement.raise_nodes(nodes, RAISED)
+        _complete(refinement, evaluate)
+        cells, values = refinement.crossed()
+    return polygons_of(cells, values)
+
+
+def _complete(refinement: Refinement, evaluate: Callable[[], Float[np.ndarray, "n"]]) -> None:
+    while len(refinement.wanted()):
+        refinement.update(evaluate())
 
 
 def _settled(
-    mesh: Mesh,
-    gradient: FieldWithGradient,
-    lower: Float[np.ndarray, "3"],
-    upper: Float[np.ndarray, "3"],
-    step_mm: float,
+    mesh: Mesh, gradient: FieldWithGradient, polygons: Polygons, refinement: Refinement, step_mm: float
 ) -> Mesh:
-    """One Newton step of each vertex along the gradient, at most half a grid step; normals from the gradient."""
-    values, slopes = gradient(mesh.vertices)
-    steepness = np.sum(slopes * slopes, axis=1)
-    free = (steepness > 0) & ((mesh.vertices >= lower) & (mesh.vertices <= upper)).all(axis=1)
-    size = np.divide(-values, np.sqrt(steepness), out=np.zeros(len(values)), where=free)
-    uphill = unit(slopes.astype(float))
-    vertices = mesh.vertices + np.clip(size, -step_mm / 2, step_mm / 2)[:, None] * uphill
-    return replace(mesh, vertices=vertices, normals=np.where(free[:, None], -uphill, mesh.normals))
+    """Vertices moved along their edges onto the surface; normals from the gradient. Those beyond the box stay.
 
-
-def _coarse_factor(lower: np.ndarray, upper: np.ndarray, step_mm: float) -> int:
-    """The largest of 1, 2, 4, 8 that leaves `COARSE_CELLS` cells along the shortest axis of the box."""
-    cells = float(np.min(upper - lower)) / step_mm if step_mm > 0 else 0.0
-    return max((factor for factor in (2, 4, 8) if cells >= COARSE_CELLS * factor), default=1)
-
-
-def _bounds(inside: Bool[np.ndarray, "i j k"]) -> tuple[np.ndarray, np.ndarray]:
-    """First and one past the last node of a box that holds the inside and one node more on each side."""
-    first, last = [], []
-    for axis in range(3):
-        occupied = np.flatnonzero(inside.any(axis=tuple({0, 1, 2} - {axis})))
-        first.append(max(occupied[0] - 1, 0))
-        last.append(min(occupied[-1] + 2, inside.shape[axis]))
-    return np.array(first), np.array(last)
-
-
-def _bridge(values: Float[np.ndarray, "i j k"]) -> None:
-    """Make node values positive, in place, until no face of a cell has its signs in a checkerboard.
-
-    Of the two negative corners of such a face the one closer to zero changes. Where two cells meet in such
-    a face, marching cubes can join four triangles in one edge; this happens in noise at the scale of the grid.
+    Where the gradient is taken matters for normals: at the zero of the cubic through four nodes of the edge's line.
     """
-    clearance = np.float32(np.abs(values).min())
-    changed = True
-    while changed:
-        changed = False
-        for first, second in ((0, 1), (0, 2), (1, 2)):
-            faces = np.moveaxis(values, (first, second), (0, 1))
-            for face in (faces, faces[::-1]):
-                a, b, c, d = face[:-1, :-1], face[1:, 1:], face[:-1, 1:], face[1:, :-1]
-                crossed = (a < 0) & (b < 0) & (c > 0) & (d > 0)
-                changed = changed or bool(crossed.any())
-                closer = a >= b
-                a[crossed & closer] = clearance
-                b[crossed & ~closer] = clearance
+    free = np.asarray(np.all((polygons.places >= 0) & (polygons.places <= refinement.shape - 1), axis=1))
+    own = np.flatnonzero(free & (polygons.axes != INTERIOR))
+    axis, starts, ends = polygons.axes[own], polygons.starts[own], polygons.ends[own]
+    at = polygons.places[own, axis] - starts[np.arange(len(own)), axis]
+    zeros = edge_zeros(at, *_interpolated(at, ends, refinement.beyond_ends(starts, axis)), ends)
+    vertices = mesh.vertices.copy()
+    vertices[own, axis] += step_mm * (zeros - at)
+    values, slopes = gradient(vertices)
+    settled = edge_zeros(zeros, values[own].astype(float), step_mm * slopes[own, axis].astype(float), ends)
+    vertices[own, axis] += step_mm * (settled - zeros)
+    return replace(mesh, vertices=vertices, normals=np.where(free[:, None], -unit(slopes.astype(float)), mesh.normals))
 
 
-def _cleared(values: Float[np.ndarray, "i j k"]) -> Float[np.ndarray, "i j k"]:
-    """Values moved away from zero by `NODE_CLEARANCE`, signs kept (zero counts as outside)."""
-    near = np.abs(values[:-1, :-1, :-1][mixed_cells(values > 0, 1)]) if min(values.shape) > 1 else np.abs(values)
-    clearance = np.float32(NODE_CLEARANCE * max(float(np.median(near)) if near.size else 0.0, 1e-30))
-    return np.where(np.abs(values) < clearance, np.where(values > 0, clearance, -clearance), values)
+def _interpolated(
+    at: Float[np.ndarray, "v"], ends: Float[np.ndarray, "v 2"], beyond: Float[np.ndarray, "v 2"]
+) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
+    """Value and slope of the cubic through the nodes at -1, 0, 1 and 2; of lower degree where the outer are unknown."""
+    rise = ends[:, 1] - ends[:, 0]
+    first, second = beyond[:, 0] - ends[:, 0] + rise, beyond[:, 1] - ends[:, 1] - rise
+    first, second = (np.nan_to_num(np.where(np.isnan(a), b, a)) for a, b in ((first, second), (second, first)))
+    bend, twist = first / 2.0, (second - first) / 6.0
+    value = ends[:, 0] + at * (rise + (at - 1.0) * (bend + (at + 1.0) * twist))
+    return value, rise + (2.0 * at - 1.0) * bend + (3.0 * at * at - 1.0) * twist
+
+
+def edge_zeros(
+    at: Float[np.ndarray, "v"],
+    values: Float[np.ndarray, "v"],
+    slopes: Float[np.ndarray, "v"],
+    ends: Float[np.ndarray, "v 2"],
+) -> Float[np.ndarray, "v"]:
+    """Where the cubic through the ends of an edge, and through value and slope at a place on it, is zero.
+
+    Newton's method, by bisection where it would leave the edge; the ends are of opposite signs.
+
+    Args:
+        at: places, from 0 to 1.
+        values, slopes: there.
+        ends: values at 0 and 1.
+    """
+    # An end too close to the place tells nothing of the bend; the other's parabola serves.
+    start, end = ((ends[:, k] - values - slopes * (k - at)) / np.maximum(np.square(k - at), 1e-12) for k in (0, 1))
+    start, end = np.where(at < NEAR_END, end, start), np.where(at > 1.0 - NEAR_END, start, end)
+    cubic, square = end - start, start + (end - start) * at
+    low, high = np.zeros_like(at), np.ones_like(at)
+    zero = at
+    for _ in range(NEWTON_STEPS):
+        way = zero - at
+        value = values + way * (slopes + way * (square + way * cubic))
+        tilt = slopes + way * (2.0 * square + 3.0 * way * cubic)
+        before = (value > 0) == (ends[:, 0] > 0)
+        low, high = np.where(before, zero, low), np.where(before, high, zero)
+        following = zero - np.divide(value, tilt, out=np.full_like(zero, np.inf), where=tilt != 0)
+        zero = np.where((following >= low) & (following <= high), following, (low + high) / 2.0)
+    return np.asarray(np.clip(zero, EDGE_MARGIN, 1.0 - EDGE_MARGIN))
+
+
+def _coarse_factor(lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], step_mm: float) -> int:
+    """The largest power of two that leaves `COARSE_CELLS` cells along the shortest axis of the box."""
+    cells = float(np.min(np.asarray(upper) - lower)) / step_mm if step_mm > 0 else 0.0
+    return max((factor for factor in FACTORS if cells >= COARSE_CELLS * factor), default=1)

@@ -1,105 +1,235 @@
 """Values of a scalar field on a grid that gets finer where the zero surface can be; knows no network.
 
-Multiresolution isosurface extraction: `Refinement` asks for points (`query`), takes their values (`update`)
-and in the end gives the dense grid (`grid`) (Mescheder et al., Occupancy Networks, 2019).
+Multiresolution isosurface extraction (Mescheder et al., Occupancy Networks, 2019): `Refinement` asks for points
+(`query`), takes their values (`update`) and in the end gives the cells through which the surface runs (`crossed`).
+Only nodes near the surface are held, in `model.inference.lattice`.
+
+Which cells may be left out. In a cell of size ``s`` let ``T`` be the trilinear interpolant of the field ``f`` at the
+corners. If ``|f - T| <= E`` there, and the corners of one of the cell's eighths are of one sign and further than ``E``
+from zero in ``T``, then ``f`` has no zero in that eighth, for ``T`` takes its extremes at corners. Two bounds are used:
+
+- With a slope ``|grad f| <= L`` that the caller vouches for: ``|f(x) - T(x)| <= sum_c w_c(x) L |x - c|``, with the
+  interpolation's weights ``w_c``. The sum is largest in the middle of the cell, so ``E = sqrt(3) / 2 * s * L``. Then no
+  node of the finest grid can have another sign than the field: a proof.
+- Measured: for a twice differentiable field ``|f - T| <= s^2 / 8 sum_i max |f_ii|``. The second derivatives are taken
+  from second differences ``D_i`` at the corners, and ``E = KINK / 8 * sum_i max |D_i|``. For a smooth field that is
+  four times the bound. For a field with a kink, such as the distance to a plate, a needle or a ball thinner than
+  the cell (where ``f`` rises to a ridge between the corners and falls again, with equal slopes), four times is what
+  is needed: a plate half-way between two nodes has ``|D| = s L``, and its ridge stands ``s L / 2`` above ``T``.
+
+The second fails where a field gives no sign of what is between its nodes: flat except close to a part that is
+thinner than a coarse cell and connected to nothing. What is connected is followed, whatever its slopes.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy import ndimage
+from jaxtyping import Bool, Float, Int, UInt8
 
 from model.errors import InvalidParameter
+from model.inference.lattice import CORNERS, Nodes, SparseLattice, corners_of
 
-#: How far from a cell's corners the surface is looked for without a sign change, in cell sizes: everywhere
-#: (half a diagonal), in the last step only as far as spares a round of following the surface.
-COARSE_REACH = 3**0.5 / 2
-FINEST_REACH = 0.3
+#: Share of the interpolation error's bound by second differences that a ridge between two nodes can reach.
+KINK = 4.0
+#: Weights of a cell's corners in the corners of its eighths: (eighth, corner of the eighth, corner).
+_HALVES: Float[np.ndarray, "8 8 8"] = np.prod(
+    1.0 - np.abs((CORNERS[:, None] + CORNERS[None])[:, :, None] / 2.0 - CORNERS), axis=-1, dtype=np.float32
+)
+#: Bits of the corners on each face: (axis, side).
+_FACE_BITS: UInt8[np.ndarray, "3 2"] = np.packbits(
+    [[CORNERS[:, k] == side for side in (0, 1)] for k in range(3)], axis=2
+)[:, :, 0]
+_AXES: Int[np.ndarray, "3 3"] = np.eye(3, dtype=np.int64)
 
 
 class Refinement:
-    """Values of a field on a grid that is refined where the zero surface can be.
+    """Values of a field on a grid that is refined where the zero surface can be (see the module).
 
-    Starts with every ``coarse_factor``-th node. Each level halves the step in the cells that hold a
-    sign change, in their neighbours on the coarsest level, and in those whose values are so small,
-    compared with the slopes around them, that the surface could pass between the corners, as it does
-    where a part is thinner than a cell. When the finer nodes on the border of the refined region show
-    a sign change, the cells beyond are refined too, until the surface is closed. Other nodes are
-    interpolated, which keeps their sign.
+    Starts with every ``coarse_factor``-th node; each level halves the step in the cells that cannot be left
+    out. When a face of a cell shows a sign change, the cell beyond is looked at too, until the surface is closed or
+    meets the border of the box; there, cells with a positive corner on the border belong to it.
 
     Args:
         lower, upper: corners of the box (mm).
         step_mm: distance of the finest nodes; the first is at `lower`, the last at or just past `upper`.
         coarse_factor: coarsest step in finest steps, a power of two.
+        steepest: bound of the field's slope (1/mm), where the caller has one; by second differences when None.
     """
 
     def __init__(
-        self, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], step_mm: float, coarse_factor: int = 4
+        self,
+        lower: Float[np.ndarray, "3"],
+        upper: Float[np.ndarray, "3"],
+        step_mm: float,
+        coarse_factor: int = 4,
+        steepest: float | None = None,
     ) -> None:
         _check(lower, upper, step_mm, coarse_factor)
         self._origin = np.asarray(lower, float)
         self._step = step_mm
-        self._cells = np.maximum(np.ceil((np.asarray(upper, float) - lower) / step_mm - 1e-6), 1).astype(int)
+        self._steepest = steepest
+        self._cells = np.maximum(np.ceil((np.asarray(upper, float) - lower) / step_mm - 1e-6), 1).astype(np.int64)
         self._stride = coarse_factor
-        self._values: Float[np.ndarray, "i j k"] = np.zeros(-(-self._cells // coarse_factor) + 1, np.float32)
-        self._known = np.zeros(self._values.shape, bool)
-        self._pending = ~self._known
-        self._refined: Bool[np.ndarray, "a b c"] | None = None
-        self._floods = 0
+        self._lattice = SparseLattice(self._counts() + 1)
+        self._fresh = self._lattice.add_cells(_all_nodes(self._counts()))
+        self._pending = self._lattice.unknown_corners(self._fresh)
         self.evaluations = 0
 
+    @property
+    def shape(self) -> Int[np.ndarray, "3"]:
+        """Nodes of the finest grid along each axis."""
+        return np.asarray(self._cells + 1)
+
     def query(self) -> Float[np.ndarray, "n 3"]:
-        """The points (mm) whose values are wanted next; none when the grid is complete."""
-        return np.asarray(self._origin + np.argwhere(self._pending) * (self._step * self._stride))
+        """The points (mm) whose values are wanted next; none when the surface is closed."""
+        return np.asarray(self._origin + self.wanted() * float(self._step))
+
+    def wanted(self) -> Nodes:
+        """The same as nodes of the finest grid; some may lie past its end."""
+        return np.asarray(self._pending * self._stride)
 
     def update(self, values: Float[np.ndarray, "n"]) -> None:
         """Take the values at the points of the last `query`."""
-        self._values[self._pending] = values
-        self._known |= self._pending
+        self._lattice.put(self._pending, values.astype(np.float32))
         self.evaluations += len(values)
-        self._pending = self._leaks()
-        while not self._pending.any() and self._stride > 1:
+        self._pending = self._pending[:0]
+        self._follow()
+        while not len(self._pending) and self._stride > 1:
             self._refine()
 
-    def grid(self) -> Float[np.ndarray, "i j k"]:
-        """All values on the finest nodes, evaluated or interpolated."""
-        i, j, k = self._cells + 1
-        return self._values[:i, :j, :k]
+    def crossed(self) -> tuple[Nodes, Float[np.ndarray, "n 8"]]:
+        """Cells of the finest grid whose corners are not all on one side, and the values at their corners.
 
-    def _leaks(self) -> Bool[np.ndarray, "i j k"]:
-        """Unknown nodes of cells beyond the refined ones into which the surface runs."""
-        if self._refined is None:
-            return np.zeros_like(self._known)
-        beyond = mixed_cells(self._values > 0, 2) & ~self._refined
-        if not beyond.any():
-            return np.zeros_like(self._known)
-        self._floods += 1
-        if self._floods > 1:
-            beyond = ndimage.binary_dilation(beyond, np.ones((3, 3, 3), bool))
-        self._refined |= beyond
-        return _nodes_of(beyond) & ~self._known
+        The grid has one more layer on each side: cells ``-1`` and ``shape - 1``, in whose outer corners the field
+        is negative, so that the surface is closed at the border of the box.
+        """
+        cells = self._lattice.cells()
+        values = self._lattice.corner_values(cells)
+        outer = self._outer(cells)
+        mixed = _mixed(values)
+        return np.concatenate([cells[mixed], outer]), np.concatenate([values[mixed], self._padded(outer)])
+
+    def beyond_ends(self, starts: Nodes, axes: Int[np.ndarray, "v"]) -> Float[np.ndarray, "v 2"]:
+        """Values at the nodes of the finest grid before and behind edges on their own lines; NaN where unknown.
+
+        Args:
+            starts: lower ends of the edges.
+            axes: of the edges.
+        """
+        nodes = starts[:, None] + np.array([-1, 2])[:, None] * _AXES[axes][:, None]
+        return np.asarray(self._lattice.values(nodes.reshape(-1, 3)).reshape(-1, 2).astype(float))
+
+    def raise_nodes(self, nodes: Nodes, value: float) -> None:
+        """Give nodes of the finest grid another value; the cells around them may then ask for theirs."""
+        self._lattice.put(nodes, np.full(len(nodes), value, np.float32))
+        around = self._within((nodes[:, None] - CORNERS).reshape(-1, 3))
+        self._lattice.add_cells(around)
+        self._fresh = np.unique(around, axis=0)
+        self._pending = self._lattice.unknown_corners(self._fresh)
+        self._follow()
+
+    def _counts(self) -> Int[np.ndarray, "3"]:
+        return np.asarray(-(-self._cells // self._stride))
+
+    def _within(self, cells: Nodes) -> Nodes:
+        first, last = np.zeros(3, np.int64), self._counts() - 1
+        inside = [(cells[:, axis] >= first[axis]) & (cells[:, axis] <= last[axis]) for axis in range(3)]
+        return np.asarray(cells[inside[0] & inside[1] & inside[2]])
+
+    def _follow(self) -> None:
+        """Put to use the cells into which the surface runs, until values are missing."""
+        while len(self._fresh) and not len(self._pending):
+            self._fresh = self._lattice.add_cells(self._within(self._beyond(self._fresh)))
+            self._pending = self._lattice.unknown_corners(self._fresh)
+
+    def _beyond(self, cells: Nodes) -> Nodes:
+        """Neighbours across faces with a sign change, and along the border of the box where the field is positive."""
+        signs = _signs(self._lattice.corner_values(cells))
+        last = self._counts() - 1
+        found = [cells[:0]]
+        for axis in range(3):
+            for side in (0, 1):
+                face = signs & _FACE_BITS[axis, side]
+                found.append(cells[(face > 0) & (face < _FACE_BITS[axis, side])] + (2 * side - 1) * _AXES[axis])
+                border = cells[(face > 0) & (cells[:, axis] == last[axis] * side)]
+                found += [border + way * _AXES[other] for other in {0, 1, 2} - {axis} for way in (-1, 1)]
+        return np.concatenate(found)
 
     def _refine(self) -> None:
         """Halve the step."""
-        cells, coarsest = mixed_cells(self._values > 0, 1), self._refined is None
-        if coarsest:
-            cells = ndimage.binary_dilation(cells, np.ones((3, 3, 3), bool))
-        reach = FINEST_REACH if self._stride == 2 and not coarsest else COARSE_REACH
-        self._refined = cells | _within_reach(self._values, reach)
+        cells = self._lattice.cells()
+        values = self._lattice.corner_values(cells)
+        error = self._errors(cells)
+        eighths = (_HALVES.reshape(64, 8) @ values.T).reshape(8, 8, -1)
+        outside, inside = eighths.min(axis=1) <= error, eighths.max(axis=1) >= -error
         self._stride //= 2
-        self._floods = 0
-        self._values = _prolonged(self._values)
-        known = np.zeros(self._values.shape, bool)
-        known[::2, ::2, ::2] = self._known
-        self._known = known
-        self._pending = _nodes_of(self._refined) & ~known
+        kept = [self._children(cells, k, outside[k] & inside[k], inside[k]) for k in range(8)]
+        parents, self._lattice = self._lattice, SparseLattice(self._counts() + 1)
+        self._fresh = self._lattice.add_cells(np.concatenate(kept))
+        self._inherit(parents)
+        self._pending = self._lattice.unknown_corners(self._fresh)
+        self._follow()
+
+    def _children(self, cells: Nodes, number: int, near: Bool[np.ndarray, "n"], inside: Bool[np.ndarray, "n"]) -> Nodes:
+        """One eighth of each cell, where the surface may run in it or the object meets the border of the box there."""
+        found = [2 * cells[near] + CORNERS[number]]
+        for axis in range(3):
+            child = 2 * cells[:, axis] + CORNERS[number, axis]
+            border = (child == 0) | (child >= self._counts()[axis] - 1)
+            found.append(2 * cells[border & inside & ~near] + CORNERS[number])
+        return self._within(np.concatenate(found))
+
+    def _inherit(self, parents: SparseLattice) -> None:
+        """Take over the values of nodes that the coarser grid had."""
+        nodes = self._lattice.unknown_corners(self._fresh)
+        shared = nodes[~np.any(nodes & 1, axis=1)]
+        values = parents.values(shared >> 1)
+        known = ~np.isnan(values)
+        self._lattice.put(shared[known], values[known])
+
+    def _errors(self, cells: Nodes) -> Float[np.ndarray, "n"]:
+        """Bound of the interpolation's error in each cell."""
+        if self._steepest is not None:
+            return np.full(len(cells), 3**0.5 / 2 * self._stride * self._step * self._steepest, np.float32)
+        bends = [self._bend(cells, axis) for axis in range(3)]
+        return np.asarray(np.float32(KINK / 8.0) * (bends[0] + bends[1] + bends[2]))
+
+    def _bend(self, cells: Nodes, axis: int) -> Float[np.ndarray, "n"]:
+        """Largest second difference along an axis at the corners; infinite where no neighbour is known."""
+        offsets = [(-1, 0, 1, 2) if other == axis else (0, 1) for other in range(3)]
+        values = np.moveaxis(self._lattice.around(cells, *offsets), axis + 1, 0).reshape(4, len(cells), 4)
+        bends = np.abs(values[:2] - 2.0 * values[1:3] + values[2:])
+        largest = np.fmax(bends[0], bends[1])
+        largest = np.fmax(np.fmax(largest[:, 0], largest[:, 1]), np.fmax(largest[:, 2], largest[:, 3]))
+        return np.asarray(np.where(np.isnan(largest), np.float32(np.inf), largest))
+
+    def _outer(self, cells: Nodes) -> Nodes:
+        """Cells beyond the border that have a positive corner on it."""
+        border = cells[np.any((cells == 0) | (cells == self._cells - 1), axis=1)]
+        nodes = corners_of(border)
+        nodes = nodes[np.any((nodes == 0) | (nodes == self._cells), axis=1)]
+        nodes = np.unique(nodes[self._lattice.values(nodes) > 0], axis=0)
+        around = np.unique((nodes[:, None] - CORNERS).reshape(-1, 3), axis=0)
+        return around[np.any((around < 0) | (around >= self._cells), axis=1)]
+
+    def _padded(self, cells: Nodes) -> Float[np.ndarray, "n 8"]:
+        """Values at the corners of cells beyond the border."""
+        nodes = corners_of(cells)
+        values = self._lattice.values(np.clip(nodes, 0, self._cells))
+        outside = np.any((nodes < 0) | (nodes > self._cells), axis=1)
+        return np.where(outside, -np.abs(values), values).reshape(-1, 8)
 
 
-def mixed_cells(inside: Bool[np.ndarray, "i j k"], span: int) -> Bool[np.ndarray, "a b c"]:
-    """Cells of `span` node intervals along each axis whose nodes are not all on one side."""
-    some = every = inside
-    for axis in range(3):
-        some, every = _pooled(some, axis, span, np.logical_or), _pooled(every, axis, span, np.logical_and)
-    return np.asarray(some & ~every)
+def _signs(values: Float[np.ndarray, "n 8"]) -> UInt8[np.ndarray, "n"]:
+    """Positive corners as bits."""
+    return np.packbits(values > 0, axis=1)[:, 0]
+
+
+def _mixed(values: Float[np.ndarray, "n 8"]) -> Bool[np.ndarray, "n"]:
+    signs = _signs(values)
+    return np.asarray((signs > 0) & (signs < 255))
+
+
+def _all_nodes(counts: Int[np.ndarray, "3"]) -> Nodes:
+    return np.stack(np.unravel_index(np.arange(int(np.prod(counts))), tuple(counts)), axis=1)
 
 
 def _check(lower: np.ndarray, upper: np.ndarray, step_mm: float, coarse_factor: int) -> None:
@@ -109,50 +239,3 @@ def _check(lower: np.ndarray, upper: np.ndarray, step_mm: float, coarse_factor: 
         raise InvalidParameter("The box of a surface must have a finite positive size along each axis.", part="box")
     if coarse_factor < 1 or coarse_factor & (coarse_factor - 1):
         raise InvalidParameter("The coarse factor must be a power of two.", part="coarse_factor")
-
-
-def _pooled(nodes: np.ndarray, axis: int, span: int, combine: np.ufunc) -> np.ndarray:
-    line = np.moveaxis(nodes, axis, 0)
-    result = combine(line[:-1:span], line[span::span])
-    if span == 2:
-        result = combine(result, line[1::2])
-    return np.moveaxis(result, 0, axis)
-
-
-def _nodes_of(cells: Bool[np.ndarray, "a b c"]) -> Bool[np.ndarray, "i j k"]:
-    """The nodes at half the step that belong to cells, corners and middles."""
-    nodes = cells
-    for axis in range(3):
-        line = np.moveaxis(nodes, axis, 0)
-        wide = np.zeros((2 * len(line) + 1, *line.shape[1:]), bool)
-        wide[1::2] = line
-        wide[:-1:2] = line
-        wide[2::2] |= line
-        nodes = np.moveaxis(wide, 0, axis)
-    return nodes
-
-
-def _prolonged(values: Float[np.ndarray, "i j k"]) -> Float[np.ndarray, "a b c"]:
-    """Trilinear interpolation to half the step."""
-    for axis in range(3):
-        line = np.moveaxis(values, axis, 0)
-        wide = np.empty((2 * len(line) - 1, *line.shape[1:]), np.float32)
-        wide[::2] = line
-        wide[1::2] = (line[:-1] + line[1:]) / 2
-        values = np.moveaxis(wide, 0, axis)
-    return np.ascontiguousarray(values)
-
-
-def _within_reach(values: Float[np.ndarray, "i j k"], reach: float) -> Bool[np.ndarray, "a b c"]:
-    """Cells with a corner so close to zero that, with slopes like those around, the surface is within `reach`."""
-    squared = np.zeros([n - 1 for n in values.shape], np.float32)
-    for axis in range(3):
-        slope = np.diff(values, axis=axis)
-        for other in {0, 1, 2} - {axis}:
-            line = np.moveaxis(slope, other, 0)
-            slope = np.moveaxis((line[:-1] + line[1:]) / 2, 0, other)
-        squared += slope**2
-    nearest = np.abs(values)
-    for axis in range(3):
-        nearest = _pooled(nearest, axis, 1, np.minimum)
-    return np.asarray(nearest**2 <= reach**2 * ndimage.maximum_filter(squared, 3))

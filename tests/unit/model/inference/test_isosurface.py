@@ -79,19 +79,19 @@ def test_gradient_puts_vertices_and_normals_onto_the_surface():
     ball = sphere(10.0, CENTRE)
     mesh = extract_surface(ball.logits, np.full(3, -13.0), np.full(3, 13.0), 1.0, gradient=ball.logits_and_gradients)
     outward = (mesh.vertices - CENTRE) / 10.0
-    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 1.0, atol=1e-9)
-    np.testing.assert_allclose(mesh.normals, outward, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(mesh.normals, outward, atol=2e-3)
     assert is_watertight(mesh)
 
 
 def test_gradient_makes_vertices_of_a_curved_field_fourth_order_accurate():
     shape = Ellipsoid((7.0, 9.0, 20.0), np.array(CENTRE), TURN)
     errors = []
-    for step in (2.0, 1.0):
+    for step in (4.0, 2.0):
         mesh = extract_surface(shape.logits, LOW, HIGH, step, gradient=shape.logits_and_gradients)
         errors.append(np.abs(shape.logits(mesh.vertices)).max())
     assert errors[1] < errors[0] / 8.0
-    assert errors[1] < 0.005
+    assert errors[1] < 1e-3
 
 
 def test_volume_and_area_come_close_to_the_exact_ones():
