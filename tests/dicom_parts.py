@@ -155,6 +155,19 @@ def _contour(kind: str, points: Float[np.ndarray, "n 3"]) -> Dataset:
     return item
 
 
+def ring(images, number: int, radii: tuple[float, ...]):
+    """Squares around the middle of an image, in LPS mm."""
+    image = images[number]
+    row, column = np.array(image.ImageOrientationPatient, float).reshape(2, 3)
+    middle = (
+        np.array(image.ImagePositionPatient, float)
+        + (int(image.Columns) / 2 - 2.7) * row
+        + (int(image.Rows) / 2 - 2.6) * column
+    )
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+    return [middle + radius * (corners @ np.stack([row, column])) for radius in radii]
+
+
 def file_bytes(found: Dataset) -> bytes:
     """The object as a DICOM file with its preamble."""
     buffer = io.BytesIO()

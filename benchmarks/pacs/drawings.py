@@ -60,7 +60,7 @@ def _image(common: Dataset, lps: Float[np.ndarray, "4 4"], number: int) -> Datas
 
 def placed(mask: Path, grid: Grid) -> Bool[np.ndarray, "i j k"]:
     """A mask of anatomy (NIfTI) in the middle of a grid, by nearest voxels; orientations in the world are kept."""
-    loaded = nib.load(mask)
+    loaded = nib.Nifti1Image.from_filename(mask)
     values = np.asarray(loaded.dataobj) > 0
     own = Grid(values.shape, np.asarray(loaded.affine, float))
     middle = own.to_world(np.argwhere(values).astype(float)).mean(axis=0)

@@ -10,10 +10,11 @@ from model.geometry import Grid
 from service.adapters.dicom.objects import quiet
 from service.adapters.dicom.planes import FramePlane, frame_planes, parallel_groups, stack_grid
 
-
 #: Elements of patient and study that every image has to have, if without a value (type 2; PS3.3, C.7.1.1 and C.7.2.1).
-COMMON = ("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "AccessionNumber")
-COMMON += ("StudyID", "StudyDate", "StudyTime", "ReferringPhysicianName")
+COMMON = (
+    *("PatientName", "PatientID", "PatientBirthDate", "PatientSex"),
+    *("AccessionNumber", "StudyID", "StudyDate", "StudyTime", "ReferringPhysicianName"),
+)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from service.adapters.dicom.masks import read_dicom_mask, stacks_of_object
 from service.adapters.dicom.series import series_of
 from service.adapters.images import ImageLimits, read_masks
 from tests.analytic_shapes import Ellipsoid
-from tests.dicom_parts import file_bytes, grid_of, mr_series, reread, rtstruct_of, seg_of
+from tests.dicom_parts import file_bytes, grid_of, mr_series, reread, ring, rtstruct_of, seg_of
 
 LIMITS = ImageLimits(max_bytes=1 << 24, max_voxels=1 << 22)
 TURNED = ((0.8, 0.6, 0.0), (0.0, 0.0, -1.0))
@@ -120,15 +120,6 @@ def test_drawing_across_the_frames_keeps_the_frames_around_it():
     (stack,) = stacks_of_object(reread(seg_of(images, crossed.astype(np.uint8))), "mask[0]", LIMITS, home=grid)
     assert not stack.excluded.any()
     assert find_planes((stack,), "auto") == (Plane(0, 0, 18), Plane(0, 1, 15))
-
-
-def ring(images, number: int, radii: tuple[float, ...]):
-    """Squares around the middle of an image, in LPS mm."""
-    image = images[number]
-    row, column = np.array(image.ImageOrientationPatient, float).reshape(2, 3)
-    middle = np.array(image.ImagePositionPatient, float) + 15.3 * row + 12.4 * column
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
-    return [middle + radius * (corners @ np.stack([row, column])) for radius in radii]
 
 
 def test_holes_by_keyhole_and_by_xor_are_the_same_holes():

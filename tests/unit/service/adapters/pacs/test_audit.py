@@ -1,0 +1,59 @@
+"""The trail says who sent what and where results went, and shows where it was tampered with."""
+
+import json
+from multiprocessing import get_context
+
+from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome, broken_line
+
+
+def entry(number: int) -> AuditEntry:
+    return AuditEntry(AuditEvent.RECEIVED, "VIEWER", "MORPHOFLOW", f"1.2.{number}", [("1.2.840", f"1.2.{number}.1")])
+
+
+def write(path, count: int) -> None:
+    for number in range(count):
+        AuditTrail(path).write(entry(number))
+
+
+def test_lines_say_who_what_and_whither(tmp_path):
+    trail = AuditTrail(tmp_path / "audit.jsonl")
+    trail.write(entry(7))
+    trail.write(AuditEntry(AuditEvent.REFUSED, "NOBODY", "MORPHOFLOW", outcome=Outcome.SERIOUS_FAILURE, note="Why."))
+    first, second = (json.loads(line)["message"] for line in (tmp_path / "audit.jsonl").read_text().splitlines())
+    assert [p["UserID"] for p in first["ActiveParticipant"]] == ["VIEWER", "MORPHOFLOW"]
+    assert first["EventIdentification"]["EventID"]["csd-code"] == "110104"
+    assert first["ParticipantObjectIdentification"][0]["SOPClass"] == [{"UID": "1.2.840", "Instance": ["1.2.7.1"]}]
+    assert second["EventIdentification"]["EventOutcomeIndicator"] == 8
+    assert second["EventIdentification"]["EventOutcomeDescription"] == "Why."
+
+
+def test_a_whole_trail_is_whole_and_a_changed_one_is_not(tmp_path):
+    path = tmp_path / "audit.jsonl"
+    write(path, 6)
+    assert broken_line(path) is None
+    lines = path.read_bytes().splitlines(keepends=True)
+    for broken, expected in (
+        ([*lines[:2], lines[2].replace(b"VIEWER", b"NOBODY"), *lines[3:]], 3),
+        ([*lines[:3], *lines[4:]], 4),
+        ([*lines[:1], lines[2], lines[1], *lines[3:]], 2),
+        ([lines[0], b"no json\n"], 2),
+    ):
+        path.write_bytes(b"".join(broken))
+        assert broken_line(path) == expected
+
+
+def test_processes_write_in_turn(tmp_path):
+    path = tmp_path / "audit.jsonl"
+    context = get_context("spawn")
+    writers = [context.Process(target=write, args=(path, 20)) for _ in range(3)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert broken_line(path) is None
+    assert len(path.read_text().splitlines()) == 60
+
+
+def test_the_file_is_its_owners_alone(tmp_path):
+    write(tmp_path / "audit.jsonl", 1)
+    assert (tmp_path / "audit.jsonl").stat().st_mode & 0o077 == 0

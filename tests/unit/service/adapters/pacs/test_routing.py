@@ -1,0 +1,126 @@
+"""Which objects go to which model, and which are left alone."""
+
+import numpy as np
+import pytest
+
+from model.errors import InvalidMask, InvalidParameter
+from service.adapters.pacs.configuration import Rule, load_configuration
+from service.adapters.pacs.routing import find_rule, referenced_series
+from tests.dicom_parts import mr_series, reread, ring, rtstruct_of, seg_of
+
+SIZE = (12, 10, 8)
+
+
+@pytest.fixture(scope="module")
+def images():
+    return mr_series(SIZE)
+
+
+@pytest.fixture(scope="module")
+def drawing(images):
+    both = np.zeros((*SIZE, 2), np.uint8)
+    both[3:6, 3:6, 3:6, 0] = both[7:9, 3:6, 3:6, 1] = 1
+    return reread(seg_of(images, both, labels=("Left hippocampus", "tumour")))
+
+
+def rule(**conditions) -> Rule:
+    return Rule(name="r", model="hippocampus", fetch_from="a", send_to=("a",), **conditions)
+
+
+@pytest.mark.parametrize(
+    ("conditions", "labels"),
+    [
+        ({}, None),
+        ({"segment_labels": ("*HIPPOCAMPUS",)}, {1}),
+        ({"segment_labels": ("tum?ur", "none")}, {2}),
+        ({"segment_codes": ("SCT:5366008",)}, {1, 2}),
+        ({"segment_codes": ("SCT:5366008",), "segment_labels": ("left*",), "senders": ("VIEWER",)}, {1}),
+    ],
+)
+def test_conditions_that_hold(drawing, conditions, labels):
+    match = find_rule([rule(**conditions)], drawing, "VIEWER")
+    assert match is not None
+    assert match.labels == (None if labels is None else frozenset(labels))
+
+
+@pytest.mark.parametrize(
+    "conditions",
+    [
+        {"senders": ("OTHER",)},
+        {"segment_labels": ("femur",)},
+        {"segment_codes": ("SCT:71341001",)},
+        {"body_parts": ("KNEE",)},
+    ],
+)
+def test_conditions_that_do_not_hold(drawing, conditions):
+    assert find_rule([rule(**conditions)], drawing, "VIEWER") is None
+
+
+def test_the_first_rule_that_holds_takes_the_object(drawing):
+    rules = [rule(senders=("OTHER",)), rule(mirror="auto"), rule()]
+    match = find_rule(rules, drawing, "VIEWER")
+    assert match is not None
+    assert match.rule.mirror == "auto"
+
+
+def test_images_and_own_results_are_left_alone(images, drawing):
+    assert find_rule([rule()], images[0], "VIEWER") is None
+    own = reread(drawing)
+    own.Manufacturer = "MorphoFlow"
+    assert find_rule([rule()], own, "VIEWER") is None
+
+
+def test_regions_of_structure_sets_are_segments(images):
+    found = rtstruct_of(images, [("CLOSED_PLANAR", ring(images, 3, (2.0,))[0])])
+    match = find_rule([rule(segment_labels=("hippo*",))], found, "VIEWER")
+    assert match is not None
+    assert match.labels == {1}
+    assert referenced_series(found) == images[0].SeriesInstanceUID
+
+
+def test_the_images_are_those_that_were_drawn_on(images, drawing):
+    assert referenced_series(drawing) == images[0].SeriesInstanceUID
+    alone = reread(drawing)
+    del alone.ReferencedSeriesSequence
+    with pytest.raises(InvalidMask, match="no series"):
+        referenced_series(alone)
+
+
+GOOD = """
+[listener]
+calling_ae_titles = ["PACS"]
+[[archives]]
+name = "a"
+dicomweb = "http://127.0.0.1:1/dicom-web"
+[[rules]]
+name = "one"
+model = "hippocampus"
+fetch_from = "a"
+send_to = ["a"]
+"""
+
+
+def test_the_file_is_read(tmp_path):
+    (tmp_path / "pacs.toml").write_text(GOOD)
+    found = load_configuration(tmp_path / "pacs.toml")
+    assert found.rule("one").send_to == ("a",)
+    assert found.archive("a").dicomweb
+    with pytest.raises(InvalidParameter):
+        found.rule("gone")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ('fetch_from = "a"', 'fetch_from = "b"', "file"),
+        ('dicomweb = "http://127.0.0.1:1/dicom-web"', "", "archives.0"),
+        ('model = "hippocampus"', 'modell = "hippocampus"', "rules.0.model"),
+        ('["PACS"]', '["A TITLE THAT IS LONGER THAN SIXTEEN"]', "listener.calling_ae_titles.0"),
+        ("[listener]", "[listener", "pacs_file"),
+    ],
+)
+def test_slips_in_the_file_are_named(tmp_path, old, new, named):
+    (tmp_path / "pacs.toml").write_text(GOOD.replace(old, new))
+    with pytest.raises(InvalidParameter) as caught:
+        load_configuration(tmp_path / "pacs.toml")
+    assert caught.value.part == named
