@@ -16,6 +16,7 @@ import yaml
 from model.errors import CohortError, InputError, MorphoFlowError, NotFound
 from service.app import create_app, interface_document, program_version
 from service.commands import OpenRegistry, models, reconstruct, sample
+from service.dicom_commands import audit, deidentify
 from service.job_commands import jobs_commands
 from service.jobs.worker import run_worker, supervised_workers
 from service.model_registry import load_registry
@@ -66,7 +67,7 @@ def build_app() -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback(invoke_without_command=True)(_program)
-    for command in (serve, worker, reconstruct, sample, models, openapi):
+    for command in (serve, worker, reconstruct, sample, models, deidentify, audit, openapi):
         app.command()(command)
     app.add_typer(jobs_commands(), name="jobs")
     return app

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from model.geometry import Grid, Pose
+from model.inference.discrepancy.covariance import Covariance
+from model.inference.discrepancy.process import Discrepancy
 from model.inference.fitting import Fit, FitStatus
 from model.inference.mesh import Mesh
 from model.inference.observations import Plane
@@ -131,7 +133,35 @@ def _state_arrays(state: ShapeState) -> dict[str, np.ndarray]:
         "rotation": np.stack([fit.pose.rotation for fit in state.fits]),
         "precision": np.stack([fit.precision for fit in state.fits]),
     }
+    for number, fit in enumerate(state.fits):
+        arrays |= {
+            f"discrepancy_{number}_{name}": values for name, values in _discrepancy_arrays(fit.discrepancy).items()
+        }
     return arrays if state.covariance is None else {**arrays, "covariance": state.covariance}
+
+
+def _discrepancy_arrays(discrepancy: Discrepancy | None) -> dict[str, np.ndarray]:
+    if discrepancy is None:
+        return {}
+    return {
+        "points": discrepancy.points,
+        "residuals": discrepancy.residuals,
+        "jacobian": discrepancy.jacobian,
+        "terms": np.array([discrepancy.covariance.sds, discrepancy.covariance.lengths]),
+        "scales": np.array([discrepancy.noise_mm, discrepancy.slope]),
+        "half_extent": discrepancy.half_extent,
+    }
+
+
+def _discrepancy(arrays: Mapping[str, np.ndarray], number: int) -> Discrepancy | None:
+    prefix = f"discrepancy_{number}_"
+    found = {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+    if not found:
+        return None
+    sds, lengths = (tuple(map(float, row)) for row in found["terms"])
+    noise, slope = map(float, found["scales"])
+    places = found["points"], found["residuals"], found["jacobian"]
+    return Discrepancy(*places, Covariance(sds, lengths), noise, slope, found["half_extent"])
 
 
 def _state(arrays: dict[str, np.ndarray], documents: list[dict[str, Any]]) -> ShapeState:
@@ -144,6 +174,7 @@ def _state(arrays: dict[str, np.ndarray], documents: list[dict[str, Any]]) -> Sh
             iterations=document["iterations"],
             objective=document["objective"],
             precision=arrays["precision"][i],
+            discrepancy=_discrepancy(arrays, i),
         )
         for i, document in enumerate(documents)
     )

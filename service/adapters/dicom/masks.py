@@ -3,9 +3,9 @@
 from typing import BinaryIO
 
 from pydicom import Dataset
-from pydicom.uid import RTStructureSetStorage
+from pydicom.uid import UID, RTStructureSetStorage
 
-from model.errors import UnreadableImage
+from model.errors import InvalidMask, UnreadableImage
 from model.geometry import Grid
 from model.inference.mask_stack import MaskStack
 from service.adapters.dicom.objects import read_object, tolerant
@@ -51,3 +51,24 @@ def stacks_of_object(
         f"{part} is a DICOM object of another kind; segmentations (SEG) and structure sets (RTSTRUCT) are accepted",
         part=part,
     )
+
+
+def referenced_series(found: Dataset) -> UID:
+    """Series Instance UID of the images that were drawn on.
+
+    Raises:
+        InvalidMask: the object refers to no series.
+    """
+    with tolerant("object"):
+        if found.SOPClassUID == RTStructureSetStorage:
+            items = [
+                series
+                for frame in found.get("ReferencedFrameOfReferenceSequence") or []
+                for study in frame.get("RTReferencedStudySequence") or []
+                for series in study.get("RTReferencedSeriesSequence") or []
+            ]
+        else:
+            items = list(found.get("ReferencedSeriesSequence") or [])
+        if items:
+            return UID(items[0].SeriesInstanceUID)
+    raise InvalidMask("The object refers to no series of images; a drawing on images is accepted.", part="object")

@@ -10,11 +10,11 @@ from typing import Any
 
 from pydicom import Dataset, dcmread
 
+from service.adapters.dicom.masks import referenced_series
 from service.adapters.dicom.objects import quiet, read_object
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail
 from service.adapters.pacs.configuration import Archive, PacsConfiguration
 from service.adapters.pacs.inbox import IMAGES, INBOX, OBJECT, quarantine
-from service.adapters.pacs.routing import referenced_series
 from service.job_ports import BlobStore
 from service.pacs_ports import PictureArchive
 

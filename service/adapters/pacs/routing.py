@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 from pydicom import Dataset
-from pydicom.uid import UID, RTStructureSetStorage
+from pydicom.uid import RTStructureSetStorage
 
-from model.errors import InvalidMask
 from service.adapters.dicom.derivation import MANUFACTURER
 from service.adapters.dicom.masks import DRAWINGS
 from service.adapters.dicom.objects import tolerant
@@ -47,27 +46,6 @@ def find_rule(rules: Sequence[Rule], found: Dataset, sender: str) -> Match | Non
             named = bool(rule.segment_codes or rule.segment_labels)
             return Match(rule, frozenset(segment.number for segment in wanted) if named else None)
     return None
-
-
-def referenced_series(found: Dataset) -> UID:
-    """Series Instance UID of the images that were drawn on.
-
-    Raises:
-        InvalidMask: the object refers to no series.
-    """
-    with tolerant("object"):
-        if found.SOPClassUID == RTStructureSetStorage:
-            items = [
-                series
-                for frame in found.get("ReferencedFrameOfReferenceSequence") or []
-                for study in frame.get("RTReferencedStudySequence") or []
-                for series in study.get("RTReferencedSeriesSequence") or []
-            ]
-        else:
-            items = list(found.get("ReferencedSeriesSequence") or [])
-        if items:
-            return UID(items[0].SeriesInstanceUID)
-    raise InvalidMask("The object refers to no series of images; a drawing on images is accepted.", part="object")
 
 
 def _segments(found: Dataset) -> list[Segment]:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from model.errors import InvalidMask, InvalidParameter
+from service.adapters.dicom.masks import referenced_series
 from service.adapters.pacs.configuration import Rule, load_configuration
-from service.adapters.pacs.routing import find_rule, referenced_series
+from service.adapters.pacs.routing import find_rule
 from tests.dicom_parts import mr_series, reread, ring, rtstruct_of, seg_of
 
 SIZE = (12, 10, 8)
