@@ -5,13 +5,15 @@ from jaxtyping import Float
 
 from model.bundle import ShapeModel
 from model.inference.fitting import Fit, FitOptions, fit_together
-from model.inference.objective import Place, reweighted
-from model.inference.observations import Observations
+from model.inference.objective import LinearPrior, Place, reweighted
+from model.inference.observations import Observations, thinned
 
 #: Members of an ensemble, as in the paper.
 MEMBERS = 25
 #: Members end at this predicted decrease (nats), far below the spread between them.
-TOLERANCE = 0.1
+TOLERANCE = 0.3
+#: Members see one observation of so many.
+EVERY = 2
 
 
 def fit_ensemble(
@@ -27,10 +29,12 @@ def fit_ensemble(
     base = model.prior.to_base(found.latent[None]) + 0.5 * sigmas * random.standard_normal((members, len(sigmas)))
     planes = len(observations.planes)
     shares = [random.dirichlet(np.ones(planes)) * planes * _trust(found, planes) for _ in range(members)]
-    weighted = [reweighted(observations, share) for share in shares]
+    fewer = thinned(observations, EVERY, seed=seed)
+    weighted = [reweighted(fewer, share) for share in shares]
     starts = [Place(latent, found.pose) for latent in model.prior.from_base(base)]
     options = FitOptions(robust=False, tolerance=TOLERANCE)
-    return tuple(fit_together(model, weighted, starts, options, coarse_sharpness=1.0))
+    tangent = LinearPrior.around(model.prior, found.latent).base_jacobian
+    return tuple(fit_together(model, weighted, starts, options, coarse_sharpness=1.0, coarse_prior=tangent))
 
 
 def _trust(found: Fit, planes: int) -> Float[np.ndarray, "k"]:

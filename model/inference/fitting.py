@@ -18,7 +18,7 @@ from model.geometry import Pose
 from model.inference.descent import Descent, Referee, descend
 from model.inference.fit_types import Fit, FitOptions, FitStatus, MirrorRule
 from model.inference.leave_out import contradicting_plane, most_wrong
-from model.inference.objective import Objective, Place, pose_offset, reweighted
+from model.inference.objective import BaseJacobian, Objective, Place, pose_offset, reweighted
 from model.inference.observations import Observations, thinned
 
 __all__ = [
@@ -42,11 +42,14 @@ COARSE_TOLERANCE, COARSE_ITERATIONS = 1.0, 8
 #: A start is given up when after so many coarse iterations, or at their end, its objective exceeds the best one's by
 #: more than this many nats and this share of it.
 TRIAL_ITERATIONS, BEHIND_NATS, BEHIND_SHARE = 3, 10.0, (1.0, 0.25)
+#: Objects fill about this share of the model's box; a drawing shorter than the second share of that may be of one end.
+MEAN_SHARE, SHORT_SHARE = 0.8, 0.55
 
 
 def fit(model: ShapeModel, observations: Observations, options: FitOptions) -> Fit:
     """The best of the fits from every starting pose that the options allow, less planes that contradict the others."""
-    found = _from_starts(model, observations, starting_poses(observations, options), options)
+    poses = starting_poses(observations, options)
+    found = _from_starts(model, observations, [*poses, *_poses_beyond(model, observations, poses)], options)
     return _without_wrong_planes(model, observations, found, options) if options.robust else found
 
 
@@ -93,6 +96,21 @@ def starting_poses(observations: Observations, options: FitOptions) -> Sequence[
     return [Pose(centre, turn, mirrored=side) for side in sides for turn in turns]
 
 
+def _poses_beyond(model: ShapeModel, observations: Observations, poses: Sequence[Pose]) -> list[Pose]:
+    """Poses with the object's middle to both sides of the drawing, where that is short for an object of this kind.
+
+    From the centroid of one drawn end the fit would turn and squeeze the object into that end.
+    """
+    inside = observations.points[(observations.labels > 0) & (observations.weights > 0)]
+    sizes = 2.0 * MEAN_SHARE * np.asarray(model.manifest.half_extent_mm)
+    extents = np.ptp(inside, axis=0)
+    axis = int(np.argmin(extents / sizes))
+    if extents[axis] > SHORT_SHARE * sizes[axis]:
+        return []
+    shift = 0.5 * (sizes[axis] - extents[axis]) * np.eye(3)[axis]
+    return [replace(pose, position=pose.position + side * shift) for pose in poses for side in (-1.0, 1.0)]
+
+
 def fit_from(
     model: ShapeModel,
     observations: Observations,
@@ -111,13 +129,15 @@ def fit_together(
     starts: Sequence[Place],
     options: FitOptions,
     coarse_sharpness: float = COARSE_SHARPNESS,
+    coarse_prior: BaseJacobian | None = None,
 ) -> list[Fit]:
     """Fits side by side, each to observations of its own (as many in each) from a place of its own.
 
     Args:
         coarse_sharpness: of the first stage; 1 when the starts are near the optimum.
+        coarse_prior: the prior that the first stage sees; the model's when None.
     """
-    coarse = _coarse(model, observations, starts, options, coarse_sharpness)
+    coarse = _coarse(model, observations, starts, options, coarse_sharpness, base_jacobian=coarse_prior)
     fine = descend(
         [Objective(model, one, start.pose, options) for one, start in zip(observations, starts, strict=True)],
         [_place(one) for one in coarse],
@@ -150,11 +170,12 @@ def _coarse(
     options: FitOptions,
     sharpness: float,
     referee: Referee = lambda problems: None,
+    base_jacobian: BaseJacobian | None = None,
 ) -> list[Descent]:
     """The first stage: blunt logits on few observations."""
     rough = [thinned(one, _coarse_step(len(one.points)), seed=0) for one in observations]
     return descend(
-        [Objective(model, one, start.pose, options) for one, start in zip(rough, starts, strict=True)],
+        [Objective(model, one, start.pose, options, base_jacobian) for one, start in zip(rough, starts, strict=True)],
         starts,
         sharpness,
         replace(options, tolerance=COARSE_TOLERANCE, max_iterations=COARSE_ITERATIONS),

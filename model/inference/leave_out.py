@@ -18,12 +18,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
-from model.backends import Prior
 from model.bundle import ShapeModel
 from model.geometry import Pose
 from model.inference.descent import descend
 from model.inference.fit_types import Fit, FitOptions
-from model.inference.objective import BaseJacobian, DataTerm, Objective, Place, Point
+from model.inference.objective import BaseJacobian, DataTerm, LinearPrior, Objective, Place, Point
 from model.inference.observations import Observations, thinned
 
 #: With fewer planes than this, nothing tells which of them is wrong.
@@ -45,29 +44,6 @@ TRIAL_EVERY, TRIAL_FEWEST = 4, 500
 #: They start from the optimum of all and end at this predicted decrease (nats) or, the first time, after so many
 #: iterations.
 TRIAL_TOLERANCE, TRIAL_ITERATIONS = 0.5, 8
-
-
-@dataclass(frozen=True)
-class LinearPrior:
-    """A prior's base coordinates, linear around one code; good for small steps, and free of any network."""
-
-    latent: Float[np.ndarray, "d"]
-    base: Float[np.ndarray, "d"]
-    slope: Float[np.ndarray, "d d"]
-
-    @classmethod
-    def around(cls, prior: Prior, latent: Float[np.ndarray, "d"]) -> "LinearPrior":
-        """The prior's tangent at a code."""
-        base, slope = prior.base_jacobian(latent[None])
-        return cls(latent, base[0].astype(float), slope[0].astype(float))
-
-    def base_jacobian(
-        self, latent: Float[np.ndarray, "b d"]
-    ) -> tuple[Float[np.ndarray, "b d"], Float[np.ndarray, "b d d"]]:
-        """See `model.backends.Prior`."""
-        return self.base + (latent - self.latent) @ self.slope.T, np.broadcast_to(
-            self.slope, (len(latent), *self.slope.shape)
-        )
 
 
 @dataclass(frozen=True)

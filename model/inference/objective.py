@@ -19,6 +19,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
+from model.backends import Prior
 from model.bundle import ShapeModel
 from model.geometry import Pose
 from model.inference.fit_types import FitOptions
@@ -26,6 +27,29 @@ from model.inference.observations import Observations
 
 #: Latent codes (b, d) to base coordinates (b, d) and their Jacobian (b, d, d); see `model.backends.Prior`.
 BaseJacobian = Callable[[Float[np.ndarray, "b d"]], tuple[Float[np.ndarray, "b d"], Float[np.ndarray, "b d d"]]]
+
+
+@dataclass(frozen=True)
+class LinearPrior:
+    """A prior's base coordinates, linear around one code; good for small steps, and free of any network."""
+
+    latent: Float[np.ndarray, "d"]
+    base: Float[np.ndarray, "d"]
+    slope: Float[np.ndarray, "d d"]
+
+    @classmethod
+    def around(cls, prior: Prior, latent: Float[np.ndarray, "d"]) -> "LinearPrior":
+        """The prior's tangent at a code."""
+        base, slope = prior.base_jacobian(latent[None])
+        return cls(latent, base[0].astype(float), slope[0].astype(float))
+
+    def base_jacobian(
+        self, latent: Float[np.ndarray, "b d"]
+    ) -> tuple[Float[np.ndarray, "b d"], Float[np.ndarray, "b d d"]]:
+        """See `model.backends.Prior`."""
+        return self.base + (latent - self.latent) @ self.slope.T, np.broadcast_to(
+            self.slope, (len(latent), *self.slope.shape)
+        )
 
 
 @dataclass(frozen=True)
