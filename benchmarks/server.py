@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,19 +22,35 @@ _SERVE = "import sys; from service.cli import main; sys.exit(main(sys.argv[1:]))
 
 @dataclass(frozen=True)
 class Server:
-    """A running service: its client and its process."""
+    """A running service: its client, its process, and where its log lies."""
 
     client: httpx.Client
     process: subprocess.Popen[bytes]
+    log: Path
+
+    def family(self) -> list[int]:
+        """The service's process, and those that it has started."""
+        return family(self.process.pid)
+
+    def cpu_s(self) -> float:
+        """Time (s) that the processes that live now have computed so far (Linux only)."""
+        return sum(_cpu_s(pid) for pid in self.family())
+
+    def memory_mib(self) -> float:
+        """Resident memory of the service's own process (MiB; Linux only)."""
+        return _status_kib(self.process.pid, "VmRSS:") / 1024.0
 
     def peak_memory_mib(self) -> float:
         """Largest resident memory of the process and its children so far, summed over them (MiB; Linux only)."""
-        return sum(_peak_kib(pid) for pid in _family(self.process.pid)) / 1024.0
+        return sum(_status_kib(pid, "VmHWM:") for pid in self.family()) / 1024.0
 
 
 @contextmanager
-def serving(models: tuple[Path, ...]) -> Iterator[Server]:
-    """The service with the shipped models and further bundles, on a free local port; gone afterwards."""
+def serving(models: tuple[Path, ...], settings: Mapping[str, str] | None = None) -> Iterator[Server]:
+    """The service with the shipped models and further bundles, on a free local port; gone afterwards.
+
+    Without workers for jobs unless a setting (by its environment variable) says otherwise.
+    """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
@@ -44,6 +60,8 @@ def serving(models: tuple[Path, ...]) -> Iterator[Server]:
             "MORPHOFLOW_RESULTS_FOLDER": str(Path(results) / "results"),
             "MORPHOFLOW_LOG_LEVEL": "warning",
             "MORPHOFLOW_MODELS": os.pathsep.join(str(model.resolve()) for model in models),
+            "MORPHOFLOW_JOB_WORKERS": "0",
+            **(settings or {}),
         }
         command = [sys.executable, "-c", _SERVE, "serve", "--host", "127.0.0.1", "--port", str(port)]
         log = Path(results) / "service.log"
@@ -52,7 +70,7 @@ def serving(models: tuple[Path, ...]) -> Iterator[Server]:
         try:
             with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=REQUEST_LIMIT_S) as client:
                 _wait_until_ready(client, process, log)
-                yield Server(client, process)
+                yield Server(client, process, log)
         finally:
             process.send_signal(signal.SIGTERM)
             try:
@@ -75,14 +93,20 @@ def _wait_until_ready(client: httpx.Client, process: subprocess.Popen[bytes], lo
     raise SystemExit(f"The service did not become ready: {''.join(said)}")
 
 
-def _family(pid: int) -> list[int]:
+def family(pid: int) -> list[int]:
+    """A process and all that it has started (Linux only)."""
     found = [pid]
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         for child in task.read_text().split():
-            found += _family(int(child))
+            found += family(int(child))
     return found
 
 
-def _peak_kib(pid: int) -> int:
+def _status_kib(pid: int, name: str) -> int:
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return next((int(line.split()[1]) for line in lines if line.startswith("VmHWM:")), 0)
+    return next((int(line.split()[1]) for line in lines if line.startswith(name)), 0)
+
+
+def _cpu_s(pid: int) -> float:
+    words = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")

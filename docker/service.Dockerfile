@@ -6,7 +6,7 @@ FROM python:3.11-slim-bookworm AS build
 ENV PIP_NO_CACHE_DIR=1 PYTHONDONTWRITEBYTECODE=1
 WORKDIR /src
 COPY . .
-RUN docker/install.sh /opt/morphoflow
+RUN docker/install.sh /opt/morphoflow cluster
 
 
 FROM python:3.11-slim-bookworm AS service

@@ -1,0 +1,1 @@
+"""Load and faults: what the service sustains, and what it survives."""

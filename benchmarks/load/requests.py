@@ -1,0 +1,67 @@
+"""Requests that somebody waits for: throughput beside what the computation alone allows, and latency at 80 % of it.
+
+    python -m benchmarks.load.requests --duration-s 60
+
+The ceiling is the number of cores over the time (CPU) that one reconstruction takes in this process, without HTTP; the
+ratio should be 0.9 or more. At 80 % of the measured throughput, with users that send at an even pace, the 99th
+percentile should be less than 3 times the median.
+"""
+
+import os
+import time
+from typing import Annotated
+
+import typer
+
+from benchmarks.load.traffic import MASK, send
+from benchmarks.server import serving
+from model.inference.reconstruction import Options
+from service import use_cases
+from service.adapters.mesh_formats import write_mesh
+from service.app import mask_reader
+from service.model_registry import load_registry
+from service.settings import load_settings
+
+#: Users at 80 % load; many, so that none of them holds the others up.
+USERS = 16
+
+
+def main(
+    duration_s: Annotated[float, typer.Option(min=5.0, help="Of each of the two runs.")] = 60.0,
+    cores: Annotated[int, typer.Option(min=1, help="Cores that the service may use.")] = len(os.sched_getaffinity(0)),
+    load: Annotated[float, typer.Option(min=0.1, max=1.0, help="Share of the throughput.")] = 0.8,
+) -> None:
+    """Throughput and latency of reconstructions (without uncertainty)."""
+    alone_s = computing_s(repeats=10)
+    with serving((), {"MORPHOFLOW_WORKERS": str(cores), "MORPHOFLOW_MAX_WAITING": "64"}) as server:
+        send(server, users=cores, duration_s=5.0)
+        began = server.cpu_s()
+        full = send(server, users=2 * cores, duration_s=duration_s)
+        spent_s = (server.cpu_s() - began) / max(len(full.seconds), 1)
+        paced = send(server, users=USERS, rate=load * full.rate, duration_s=duration_s)
+    ceiling = cores / alone_s
+    median_s, p99_s = paced.quantile_s(0.5), paced.quantile_s(0.99)
+    print(f"computation alone     {alone_s:8.3f} s of CPU, so at most {ceiling:.2f} requests a second on {cores} cores")
+    print(f"sustained throughput  {full.rate:8.2f} 1/s, {full.failed} failed; {spent_s:.3f} s of CPU for each request")
+    print(f"  of the ceiling      {full.rate / ceiling:8.2f} (to reach: 0.90)")
+    print(f"at {load:.0%} of it         {paced.rate:8.2f} 1/s, {paced.failed} failed", end="; ")
+    print(f"median {median_s:.3f} s, p99 {p99_s:.3f} s")
+    print(f"  p99 / median        {p99_s / median_s:8.2f} (to reach: below 3)")
+
+
+def computing_s(repeats: int) -> float:
+    """CPU time (s) of one request's computation: from the file to the surface's file."""
+    settings = load_settings({"threads": 1})
+    model = load_registry(settings).get("hippocampus")
+    read, data = mask_reader(settings), MASK.read_bytes()
+    times = []
+    for _ in range(repeats + 1):
+        began = time.process_time()
+        outcome = use_cases.reconstruct(model, read(data, "mask", None), Options(uncertainty="none"), lambda _: None)
+        write_mesh(outcome.reconstruction.mesh, "stl", space="RAS", metadata={})
+        times.append(time.process_time() - began)
+    return sorted(times[1:])[repeats // 2]
+
+
+if __name__ == "__main__":
+    typer.run(main)
