@@ -20,7 +20,7 @@ Field = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
 FieldWithGradient = Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]]
 
 #: The coarsest grid has at least this many cells along each axis.
-COARSE_CELLS = 6
+COARSE_CELLS = 5
 FACTORS = (2, 4, 8, 16, 32)
 #: Value of a node whose sign had to change.
 RAISED = 1e-30

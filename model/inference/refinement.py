@@ -18,7 +18,8 @@ from zero in ``T``, then ``f`` has no zero in that eighth, for ``T`` takes its e
   is needed: a plate half-way between two nodes has ``|D| = s L``, and its ridge stands ``s L / 2`` above ``T``.
 
 The second fails where a field gives no sign of what is between its nodes: flat except close to a part that is
-thinner than a coarse cell and connected to nothing. What is connected is followed, whatever its slopes.
+thinner than a coarse cell and connected to nothing, or parts that repeat at the period of the coarsest cells. What is
+connected is followed, whatever its slopes.
 """
 
 import numpy as np
