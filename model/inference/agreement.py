@@ -58,9 +58,10 @@ def sections_of(
     for number, plane in enumerate(observations.planes):
         here = observations.plane_of == number
         if here.any():
-            areas = drawn[here].sum(), inside[here].sum(), inside[here] @ observations.labels[here]
-            trusted = plane_weights is None or plane_weights[number] > 0
-            sections.append(Section(plane, *map(float, areas), float(error[here].mean()), bool(trusted)))
+            shared = float(inside[here] @ observations.labels[here])
+            trusted = plane_weights is None or bool(plane_weights[number] > 0)
+            areas = float(drawn[here].sum()), float(inside[here].sum()), shared
+            sections.append(Section(plane, *areas, float(error[here].mean()), trusted))
     return sections
 
 
