@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from model.errors import InconsistentStacks, InvalidMask, InvalidParameter
 from model.geometry import Grid
@@ -35,7 +36,7 @@ def find_planes(stacks: Sequence[MaskStack], rule: AnnotatedRule | Sequence[Plan
     Raises:
         InvalidMask: fewer than two planes, or no foreground on them.
         InvalidParameter: a named plane that its stack does not have, or fewer than two named.
-        InconsistentStacks: foregrounds of two stacks over `WORLD_GAP_MM` apart.
+        InconsistentStacks: the foreground of some stacks over `WORLD_GAP_MM` from that of all others.
     """
     _check_same_world(stacks)
     if isinstance(rule, str):
@@ -99,14 +100,24 @@ def _named_planes(stacks: Sequence[MaskStack], named: Sequence[Plane]) -> tuple[
 
 
 def _check_same_world(stacks: Sequence[MaskStack]) -> None:
+    """Every stack must be near another, and through such neighbours near all: many series may hold a slice each."""
     boxes = [world_box(stack.grid, *index_box(stack.foreground)) for stack in stacks]
-    for second in range(len(stacks)):
-        for first in range(second):
-            lows = np.maximum(boxes[first][0], boxes[second][0])
-            highs = np.minimum(boxes[first][1], boxes[second][1])
-            if (lows - highs).max() > WORLD_GAP_MM:
-                raise InconsistentStacks(
-                    f"{stacks[first].part} and {stacks[second].part} lie over {WORLD_GAP_MM:g} mm apart in the world; "
-                    "stacks of one object in one frame are accepted",
-                    part=stacks[second].part,
-                )
+    reached, left = [0], list(range(1, len(stacks)))
+    while left:
+        gap, first, second = min((_gap(boxes[a], boxes[b]), a, b) for a in reached for b in left)
+        if gap > WORLD_GAP_MM:
+            raise InconsistentStacks(
+                f"{stacks[first].part} and {stacks[second].part} lie over {WORLD_GAP_MM:g} mm apart in the world; "
+                "stacks of one object in one frame are accepted",
+                part=stacks[second].part,
+            )
+        reached.append(second)
+        left.remove(second)
+
+
+def _gap(
+    first: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
+    second: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
+) -> float:
+    """Largest distance (mm) between two boxes along any axis, negative where they overlap along all."""
+    return float((np.maximum(first[0], second[0]) - np.minimum(first[1], second[1])).max())

@@ -204,6 +204,17 @@ def test_stacks_must_lie_in_one_place(gap, axis):
     assert caught.value.part == "mask[1]"
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
+def test_stacks_may_be_near_each_other_through_others(order):
+    solid = cut(ellipsoid(), [(2, 12)])
+    parts = [stack_of(solid, origin=(0.0, 0.0, 15.0 * place), part=f"mask[{n}]") for n, place in enumerate(order)]
+    assert len(find_planes(parts, [Plane(number, 2, 12) for number in range(3)])) == 3
+    with pytest.raises(InconsistentStacks):
+        find_planes(
+            [part for part, place in zip(parts, order, strict=True) if place != 1], [Plane(0, 2, 12), Plane(1, 2, 12)]
+        )
+
+
 # observations
 
 
