@@ -30,6 +30,8 @@ from service.stores import jobs_url, open_blobs, open_jobs, open_results, replic
 
 #: A worker that died is started again after so long (s).
 _RESTART_AFTER_S = 1.0
+#: A worker that was told to stop has ended after so long (s), one way or the other.
+_LEAVE_WITHIN_S = 30.0
 
 
 def worker_options(settings: Settings, slot: int) -> WorkerOptions:
@@ -70,8 +72,11 @@ def run_worker(settings: Settings, registry: ModelRegistry, slot: int, *, attach
         while not stop.wait(settings.sweep_interval_s):
             remove_expired(jobs, tools.blobs, settings.result_lifetime_s, log)
             registry.refresh()
+        _leave_within(_LEAVE_WITHIN_S)
     jobs.close()
     log.info("worker stopped", slot=slot)
+    sys.stderr.flush()
+    os._exit(0)  # threads that follow jobs may wait for a database for ever
 
 
 def _pacs_kinds(settings: Settings, tools: JobTools) -> tuple[JobKind, ...]:
@@ -81,6 +86,13 @@ def _pacs_kinds(settings: Settings, tools: JobTools) -> tuple[JobKind, ...]:
     from service.jobs.pacs import pacs_kinds  # the extra pacs is needed only here
 
     return pacs_kinds(settings, settings.pacs_file, tools.registry, tools.blobs, tools.log)
+
+
+def _leave_within(limit_s: float) -> None:
+    """End this process even if its database is away and nothing can be handed back."""
+    timer = threading.Timer(limit_s, os._exit, (1,))
+    timer.daemon = True
+    timer.start()
 
 
 def _stop_with_input(stop: threading.Event) -> None:

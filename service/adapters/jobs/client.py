@@ -2,11 +2,14 @@
 
 import threading
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
-from typing import Any
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
-from dbos import DBOSClient, WorkflowStatus, WorkflowStatusString
+from dbos import DBOSClient, WorkflowStatus, WorkflowStatusString, error
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import TimeoutError as SQLAlchemyTimeout
 
 from service.adapters.jobs.database import (
     APPLICATION,
@@ -19,9 +22,11 @@ from service.adapters.jobs.database import (
     json_serializer,
     prepare,
 )
-from service.errors import UnknownJob
+from service.errors import Overloaded, UnknownJob
 from service.job_ports import JobState, JobStatus, Record
 
+P = ParamSpec("P")
+T = TypeVar("T")
 #: Event of a running job that holds its items: done and total.
 PROGRESS = "progress"
 _NAMESPACE = uuid.UUID("6d6f7270-686f-5f6c-8f77-6a6f62732d31")
@@ -33,6 +38,21 @@ _STATES = {
     WorkflowStatusString.CANCELLED.value: JobState.CANCELLED,
 }
 _FAULT = "The job met a fault of the service; its logs hold more under the job's identifier."
+
+
+def _answered(method: Callable[P, T]) -> Callable[P, T]:
+    """A database that is away is work that cannot be taken now, not a wait."""
+
+    @wraps(method)
+    def tried(*arguments: P.args, **named: P.kwargs) -> T:
+        try:
+            return method(*arguments, **named)
+        except (DBAPIError, SQLAlchemyTimeout, error.DBOSException) as fault:
+            if isinstance(fault, error.DBOSException) and not isinstance(fault.__cause__, DBAPIError):
+                raise
+            raise Overloaded("The jobs' database does not answer; send the request again later.") from fault
+
+    return tried
 
 
 class DbosJobs:
@@ -51,6 +71,7 @@ class DbosJobs:
         """Random, or the same for the same idempotency key."""
         return str(uuid.uuid4() if key is None else uuid.uuid5(_NAMESPACE, f"{kind}\n{key}"))
 
+    @_answered
     def enqueue(self, kind: str, argument: Record, identifier: str) -> JobStatus:
         """Have a job done; one that is there under the identifier is left as it is."""
         self._client.enqueue(
@@ -65,6 +86,7 @@ class DbosJobs:
         )
         return self.status(identifier)
 
+    @_answered
     def status(self, identifier: str) -> JobStatus:
         """What is known of a job; `UnknownJob` when there is none."""
         found = self._client.list_workflows(workflow_ids=[identifier], name=JOB)
@@ -73,21 +95,25 @@ class DbosJobs:
         progress = self._client.get_event(identifier, PROGRESS, 0) or {}
         return job_status(found[0], progress)
 
+    @_answered
     def cancel(self, identifier: str) -> JobStatus:
         """Stop a job with all of its parts."""
         self.status(identifier)
         self._client.cancel_workflow(identifier, cancel_children=True)
         return self.status(identifier)
 
+    @_answered
     def is_wanted(self, identifier: str) -> bool:
         """Whether a job is waiting or running."""
         found = self._client.list_workflows(workflow_ids=[identifier], load_input=False, load_output=False)
         return bool(found) and found[0].status in ("ENQUEUED", "PENDING", "DELAYED")
 
+    @_answered
     def forget(self, identifier: str) -> None:
         """Remove the record of a job and its parts."""
         self._client.delete_workflow(identifier, delete_children=True)
 
+    @_answered
     def ended_before(self, moment: datetime) -> Iterator[str]:
         """Identifiers of the jobs that ended before a moment."""
         found = self._client.list_workflows(
@@ -95,14 +121,17 @@ class DbosJobs:
         )
         return (workflow.workflow_id for workflow in found)
 
+    @_answered
     def backlog(self) -> int:
         """Parts that wait for a worker."""
         return self._open()[1].count(PARTS_QUEUE, "ENQUEUED")
 
+    @_answered
     def unfinished(self) -> int:
         """Jobs that wait or run."""
         return self._open()[1].count(JOBS_QUEUE, "ENQUEUED", "PENDING")
 
+    @_answered
     def workers(self, lease_s: float) -> int:
         """How many workers are alive."""
         return self._open()[1].alive(lease_s)
@@ -130,6 +159,7 @@ class DbosJobs:
                     dbos_system_schema=SCHEMA,
                     serializer=serializer,
                     application_name=APPLICATION,
+                    retry_connection_errors=False,
                 )
                 self._opened = client, Leases(self._url)
             return self._opened

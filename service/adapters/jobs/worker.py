@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +29,7 @@ from service.adapters.jobs.database import (
     json_serializer,
     prepare,
 )
-from service.errors import KINDS, Cancelled
+from service.errors import KINDS, Cancelled, Overloaded
 from service.job_ports import Check, JobKind, Record
 from service.observability import Log, make_log
 
@@ -217,8 +217,9 @@ class _Run:
 
 
 def _require_wanted(jobs: DbosJobs, job: str) -> None:
-    if not jobs.is_wanted(job):
-        raise Cancelled("The job was cancelled.")
+    with suppress(Overloaded):  # a database that is away does not say that nobody wants the job
+        if not jobs.is_wanted(job):
+            raise Cancelled("The job was cancelled.")
 
 
 def _rarely(check: Check) -> Check:
