@@ -1,9 +1,11 @@
 """One broken model does not stop the others."""
 
+from dataclasses import replace
+
 import pytest
 
 from model.errors import BundleCorrupt, BundleIncomplete, InvalidParameter, UnknownModel
-from service.model_registry import MANIFEST, ModelRegistry, find_bundles, load_models
+from service.model_registry import MANIFEST, ModelRegistry, OpenedOnce, find_bundles, load_models
 from tests.analytic_model import ellipsoid_model
 
 
@@ -66,3 +68,43 @@ def test_a_folder_is_a_bundle_or_holds_bundles(tmp_path):
 def test_a_folder_without_a_manifest_counts_as_broken(tmp_path):
     registry = load_models([tmp_path / "half"], opener({"half": BundleIncomplete("manifest.json is missing.")}))
     assert registry.broken[0].reason == "manifest.json is missing."
+
+
+def versioned(version, axes=(10.0, 8.0, 7.0)):
+    model = ellipsoid_model("hip", axes)
+    return replace(model, manifest=replace(model.manifest, version=version))
+
+
+def test_versions_stand_side_by_side_and_the_newest_has_the_plain_name(tmp_path):
+    found = {"x": versioned("1.10.0"), "y": versioned("1.9.0", (9.0, 9.0, 9.0))}
+    registry = load_models([tmp_path / name for name in found], opener(found))
+    assert registry.names() == ("hip",)
+    assert registry.get("hip") is registry.get(None) is found["x"]
+    assert registry.get("hip@1.9.0") is found["y"]
+    with pytest.raises(UnknownModel):
+        registry.get("hip@2.0.0")
+
+
+def test_models_are_found_again(tmp_path):
+    found = {"x": versioned("1.0.0")}
+    registry = ModelRegistry(
+        {"hip": found["x"]}, reload=lambda: load_models([tmp_path / name for name in found], opener(found))
+    )
+    assert not registry.refresh()
+    found["y"] = versioned("1.1.0", (9.0, 9.0, 9.0))
+    assert registry.refresh()
+    assert registry.get("hip") is found["y"]
+    del found["x"]
+    assert registry.refresh()
+    with pytest.raises(UnknownModel):
+        registry.get("hip@1.0.0")
+
+
+def test_a_bundle_is_opened_again_only_when_its_manifest_changes(tmp_path):
+    opened = []
+    once = OpenedOnce(lambda folder: opened.append(folder) or versioned("1.0.0"))
+    (tmp_path / MANIFEST).write_text("{}")
+    assert once(tmp_path) is once(tmp_path)
+    (tmp_path / MANIFEST).write_text("{} ")
+    once(tmp_path)
+    assert len(opened) == 2
