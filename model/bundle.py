@@ -45,6 +45,8 @@ class Manifest:
         resolution_mm: default grid step of the surface.
         calibration: how the likelihood precision was chosen; empty when it was not.
         likelihood_precision: information of one mm^2 of annotated plane, 1/mm^2; calibrated on validation shapes.
+        discrepancy: ``spread_mm`` and ``fidelity`` of what the code leaves unexplained at contours, chosen on validation
+            shapes (`model.inference.discrepancy`); empty when they were not.
         training: cohort, cases, regime, command and so on.
         licence, attribution: of the weights.
         accuracy: measured figures by regime, for example ``{"thin": {"dice": 0.87, "asd_mm": 0.34}}``.
@@ -71,6 +73,7 @@ class Manifest:
     accuracy: dict[str, dict[str, float]]
     files: dict[str, str]
     anatomy: dict[str, str] = field(default_factory=dict)
+    discrepancy: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

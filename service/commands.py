@@ -49,6 +49,10 @@ def reconstruct(
     mirror: Annotated[MirrorRule, typer.Option(help="Whether left and right are exchanged.")] = "never",
     resolution_mm: Annotated[float | None, typer.Option(help="Grid step of the surface (mm).")] = None,
     seed: Annotated[int, typer.Option(min=0, max=use_cases.MAX_SEED, help="Makes the answer repeatable.")] = 0,
+    fidelity: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=1.0, help="0 trusts the model, 1 the slices; the model's when left out."),
+    ] = None,
     output: Annotated[Path | None, typer.Option(help="Surface to write; its suffix says the format.")] = None,
     segmentation: Annotated[Path | None, typer.Option(help="Label map to write (.nii.gz).")] = None,
     entropy: Annotated[Path | None, typer.Option(help="Voxel entropy to write (.nii.gz).")] = None,
@@ -65,7 +69,7 @@ def reconstruct(
         raise InvalidParameter("--entropy needs --uncertainty laplace or ensemble.", part="--entropy")
     settings = load_settings()
     registry = context.obj(settings)
-    options = Options(parse_annotated(annotated), uncertainty, mirror, resolution_mm, seed)
+    options = Options(parse_annotated(annotated), uncertainty, mirror, resolution_mm, seed, fidelity)
     with progress(STEPS) as watch:
         watch("masks")
         stacks = _read(settings, masks, parse_labels(label or []))

@@ -44,11 +44,18 @@ class ReconstructionForm(_Closed):
         None, description="grid step of the surface (mm); the model's when left out"
     )
     seed: Seed = 0
+    fidelity: float | None = Field(
+        None,
+        ge=0.0,
+        le=1.0,
+        description="0 trusts the model, 1 trusts the slices: share of what the model leaves unexplained on the slices "
+        "that the surface follows; the one calibrated for the model when left out",
+    )
 
     def options(self) -> Options:
         """The choices as domain types."""
         annotated = parse_annotated(self.annotated)
-        return Options(annotated, self.uncertainty, self.mirror, self.resolution_mm, self.seed)
+        return Options(annotated, self.uncertainty, self.mirror, self.resolution_mm, self.seed, self.fidelity)
 
 
 class MeshQuery(_Closed):

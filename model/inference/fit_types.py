@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from model.geometry import Pose
+from model.inference.discrepancy.process import Discrepancy
 
 MirrorRule = Literal["auto", "never", "always"]
 
@@ -68,6 +69,7 @@ class Fit:
         precision: (d + 7, d + 7) curvature of the objective over (latent, pose step).
         plane_weights: (k,) trust in each annotated plane: 0 for one that contradicts the others and was left out of
             the fit, else 1; None when that was not looked into.
+        discrepancy: what the drawn contours show and the code cannot express; None when it was not asked for.
     """
 
     latent: Float[np.ndarray, "d"]
@@ -78,3 +80,4 @@ class Fit:
     objective: float
     precision: Float[np.ndarray, "p p"]
     plane_weights: Float[np.ndarray, "k"] | None = None
+    discrepancy: Discrepancy | None = None

@@ -1,4 +1,4 @@
-"""Laplace approximation of the posterior over latent code and pose, and what follows from it on the surface.
+"""Laplace approximation of the posterior over latent code, pose and discrepancy, and what follows on the surface.
 
 At the optimum the posterior is taken as Gaussian with the inverse curvature as covariance (MacKay 1992). Everything a
 user asks for is first order in the parameters: a logit moves by its Jacobian times the parameter step, and a surface
@@ -22,16 +22,24 @@ def laplace_covariance(fit: Fit) -> Float[np.ndarray, "p p"]:
     return np.asarray(cho_solve(cho_factor(fit.precision), np.eye(len(fit.precision))))
 
 
-def fitted_logits(model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Occupancy logits of the fitted shape at world points (mm)."""
+def model_logits(model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Occupancy logits of the fitted code and pose alone at world points (mm)."""
     parts = [model.decoder.logits(fit.latent[None], fit.pose.to_canonical(chunk)[None])[0] for chunk in _chunks(points)]
     return np.concatenate(parts) if parts else np.zeros(0, np.float32)
+
+
+def fitted_logits(model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Occupancy logits of the fitted shape, its discrepancy included, at world points (mm)."""
+    logits = model_logits(model, fit, points)
+    if fit.discrepancy is None or not len(points):
+        return logits
+    return fit.discrepancy.corrected(logits, fit.pose.to_canonical(points))
 
 
 def fitted_jacobians(
     model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n p"], Float[np.ndarray, "n 3"]]:
-    """Logits, their derivatives by (latent, pose step), and by world point (1/mm)."""
+    """Logits as `fitted_logits` gives them, their derivatives by (latent, pose step), and by world point (1/mm)."""
     if not len(points):
         return np.zeros(0), np.zeros((0, len(fit.precision))), np.zeros((0, 3))
     parts = [_jacobians(model, fit, chunk) for chunk in _chunks(points)]
@@ -46,8 +54,13 @@ def _jacobians(
     logits, by_latent, by_point = (
         value[0] for value in model.decoder.logits_and_jacobians(fit.latent[None], canonical[None])
     )
-    by_pose = fit.pose.jacobian(canonical, by_point)
-    return logits, np.concatenate([by_latent, by_pose], axis=1), fit.pose.gradient_to_world(by_point)
+    by_parameter = np.concatenate([by_latent, fit.pose.jacobian(canonical, by_point)], axis=1)
+    if fit.discrepancy is not None:
+        share = fit.discrepancy.shrinkage(logits)[:, None]
+        by_parameter = share * by_parameter - fit.discrepancy.slope * fit.discrepancy.carried(canonical)
+        by_point = share * by_point + fit.discrepancy.slope * fit.discrepancy.gradient(canonical)
+        logits = fit.discrepancy.corrected(logits, canonical)
+    return logits, by_parameter, fit.pose.gradient_to_world(by_point)
 
 
 def _chunks(points: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "m 3"]]:
@@ -57,8 +70,15 @@ def _chunks(points: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "m 3"]]:
 def logit_variance(
     by_parameter: Float[np.ndarray, "n p"], covariance: Float[np.ndarray, "p p"]
 ) -> Float[np.ndarray, "n"]:
-    """Posterior variance of each logit, ``J C J^T``."""
+    """Posterior variance of each logit by code and pose, ``J C J^T``."""
     return np.asarray(np.einsum("np,np->n", by_parameter @ covariance, by_parameter))
+
+
+def open_variance(fit: Fit, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Posterior variance of each logit by the discrepancy, at world points (mm)."""
+    if fit.discrepancy is None:
+        return np.zeros(len(points))
+    return fit.discrepancy.slope**2 * fit.discrepancy.variance(fit.pose.to_canonical(points))
 
 
 def mean_probability(logits: Float[np.ndarray, "n"], variance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:

@@ -8,17 +8,20 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.special import expit
 
 from model.bundle import ShapeModel
 from model.errors import InvalidMask, InvalidParameter
+from model.inference.agreement import plane_warnings, sections_of
+from model.inference.coverage import coverage_warnings
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_prior, with_discrepancy
 from model.inference.ensemble import fit_ensemble
 from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
 from model.inference.mesh import Mesh
+from model.inference.objective import reweighted
 from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
 from model.inference.posterior import fitted_logits, laplace_covariance
 from model.inference.surface import surface_of
-from model.inference.uncertainty import Estimate, ShapeState, area_estimate, displacement_factors, volume_estimate
+from model.inference.uncertainty import Estimate, ShapeState, area_estimate, surface_spread, volume_estimate
 
 UncertaintyRule = Literal["laplace", "ensemble", "none"]
 #: Called with the name of each stage as it begins: observations, fit, surface, uncertainty.
@@ -30,8 +33,6 @@ OBSERVATION_BUDGET = 2500
 RESOLUTION_RANGE_MM = (0.25, 10.0)
 #: Below this percentile of the training population a shape is called unlike it.
 ATYPICAL_PERCENTILE = 1.0
-#: The answer names a plane whose section is wrong by more than this share of itself and of the mean drawn section.
-DISAGREEMENT_LIMIT = 0.25
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,8 @@ class Options:
         mirror: whether left and right may be exchanged.
         resolution_mm: grid step of the surface; the model's own when None.
         seed: makes the answer repeatable.
+        fidelity: from 0, trust the model, to 1, trust the slices: share of what the code leaves unexplained on the
+            slices that the surface follows; the one calibrated for the model when None.
     """
 
     annotated: AnnotatedRule | tuple[Plane, ...] = "auto"
@@ -51,6 +54,7 @@ class Options:
     mirror: MirrorRule = "never"
     resolution_mm: float | None = None
     seed: int = 0
+    fidelity: float | None = None
 
 
 @dataclass(frozen=True)
@@ -111,9 +115,12 @@ def reconstruct(
     planes = find_planes(stacks, options.annotated)
     observations = observe(stacks, planes, budget=OBSERVATION_BUDGET, seed=options.seed)
     watch("fit")
-    found = fit(model, observations, FitOptions(mirror=options.mirror))
+    prior = discrepancy_prior(model.manifest, options.fidelity)
+    found = with_discrepancy(
+        model, fit(model, observations, FitOptions(mirror=options.mirror)), stacks, observations, prior
+    )
     watch("surface")
-    mesh = surface_of(model, found.latent, found.pose, options.resolution_mm)
+    mesh = surface_of(model, found.latent, found.pose, options.resolution_mm, found.discrepancy)
     if mesh.is_empty:
         raise InvalidMask(
             f"The drawing has nothing in common with a {model.manifest.structure}, no shape of it comes near; "
@@ -121,11 +128,12 @@ def reconstruct(
             part="mask",
         )
     watch("uncertainty")
-    state = _state(model, observations, found, options)
-    factors = displacement_factors(model, state, mesh)
-    if factors is not None:
-        mesh = replace(mesh, scalars={"surface_sd_mm": np.linalg.norm(factors, axis=1)})
-    sections = _sections(model, found, observations)
+    state = _state(model, stacks, observations, found, options, prior)
+    spread = surface_spread(model, state, mesh)
+    if spread is not None:
+        mesh = replace(mesh, scalars={"surface_sd_mm": spread.sd()})
+    trusted = observations if found.plane_weights is None else reweighted(observations, found.plane_weights)
+    sections = sections_of(observations, fitted_logits(model, found, observations.points), found.plane_weights)
     density, percentile = typicality(model, found)
     return Reconstruction(
         state=state,
@@ -133,11 +141,11 @@ def reconstruct(
         planes=observations.planes,
         observation_count=len(observations.points),
         residuals=tuple(PlaneResidual(s.plane, s.disagreement, s.mean_error) for s in sections),
-        volume_ml=volume_estimate(mesh, factors),
-        area_cm2=area_estimate(mesh, factors),
+        volume_ml=volume_estimate(mesh, spread),
+        area_cm2=area_estimate(mesh, spread),
         log_prior_density=density,
         typicality_percentile=percentile,
-        warnings=_warnings(found, percentile, disagreeing_planes(sections)),
+        warnings=_warnings(found, percentile) + plane_warnings(sections) + coverage_warnings(trusted, mesh.vertices),
     )
 
 
@@ -148,61 +156,28 @@ def _check(options: Options) -> None:
         raise InvalidParameter(
             f"resolution_mm is {step:g}; a grid step from {low:g} to {high:g} mm is accepted.", part="resolution_mm"
         )
+    if options.fidelity is not None and not 0.0 <= options.fidelity <= 1.0:
+        raise InvalidParameter(
+            f"fidelity is {options.fidelity:g}; 0 (trust the model) to 1 (trust the slices) is accepted.",
+            part="fidelity",
+        )
     if options.seed < 0:
         raise InvalidParameter(f"seed is {options.seed}; a whole number from 0 is accepted.", part="seed")
 
 
-def _state(model: ShapeModel, observations: Observations, found: Fit, options: Options) -> ShapeState:
+def _state(
+    model: ShapeModel,
+    stacks: Sequence[MaskStack],
+    observations: Observations,
+    found: Fit,
+    options: Options,
+    prior: DiscrepancyPrior,
+) -> ShapeState:
     if options.uncertainty == "ensemble":
-        return ShapeState((found, *fit_ensemble(model, observations, found, options.seed)), None)
+        members = fit_ensemble(model, observations, found, options.seed)
+        corrected = (with_discrepancy(model, member, stacks, observations, prior) for member in members)
+        return ShapeState((found, *corrected), None)
     return ShapeState((found,), laplace_covariance(found) if options.uncertainty == "laplace" else None)
-
-
-@dataclass(frozen=True)
-class _Section:
-    """Observations of one plane beside the reconstruction there: mm^2 drawn, reconstructed and shared."""
-
-    plane: Plane
-    drawn: float
-    reconstructed: float
-    shared: float
-    mean_error: float
-
-    @property
-    def disagreement(self) -> float:
-        """``1 - Dice``."""
-        total = self.drawn + self.reconstructed
-        return 1.0 - 2.0 * self.shared / total if total > 0 else 0.0
-
-    @property
-    def wrong(self) -> float:
-        """Area that belongs to only one of the two (mm^2)."""
-        return self.drawn + self.reconstructed - 2.0 * self.shared
-
-
-def _sections(model: ShapeModel, found: Fit, observations: Observations) -> list[_Section]:
-    logits = fitted_logits(model, found, observations.points)
-    error = observations.labels - expit(logits.astype(float))
-    drawn, inside = observations.labels * observations.weights, (logits > 0) * observations.weights
-    sections = []
-    for number, plane in enumerate(observations.planes):
-        here = observations.plane_of == number
-        if here.any():
-            shared = float(inside[here] @ observations.labels[here])
-            sections.append(
-                _Section(plane, float(drawn[here].sum()), float(inside[here].sum()), shared, float(error[here].mean()))
-            )
-    return sections
-
-
-def disagreeing_planes(sections: Sequence[_Section]) -> list[Plane]:
-    """Planes on which much of the section, and much compared with the other planes' sections, is wrong."""
-    typical = float(np.mean([section.drawn for section in sections]))
-    return [
-        section.plane
-        for section in sections
-        if section.disagreement > DISAGREEMENT_LIMIT and section.wrong > DISAGREEMENT_LIMIT * typical
-    ]
 
 
 def typicality(model: ShapeModel, found: Fit) -> tuple[float, float]:
@@ -211,11 +186,8 @@ def typicality(model: ShapeModel, found: Fit) -> tuple[float, float]:
     return density, float(100.0 * np.mean(model.population.log_densities < density))
 
 
-def _warnings(found: Fit, percentile: float, apart: Sequence[Plane]) -> tuple[str, ...]:
+def _warnings(found: Fit, percentile: float) -> tuple[str, ...]:
     sentences = [] if found.status == "converged" else [found.message]
     if percentile < ATYPICAL_PERCENTILE:
         sentences.append("The shape is unlike the population that the model was trained on; do not rely on it.")
-    if apart:
-        names = ", ".join(f"mask[{p.stack}] axis {p.axis} index {p.index}" for p in apart)
-        sentences.append(f"The reconstruction disagrees with the drawing on {names}; do not rely on it there.")
     return tuple(sentences)

@@ -5,6 +5,7 @@ from jaxtyping import Float
 
 from model.bundle import ShapeModel
 from model.geometry import Grid, Pose
+from model.inference.discrepancy.process import Discrepancy
 from model.inference.isosurface import extract_surface
 from model.inference.mesh import Mesh, extents, transformed
 
@@ -12,23 +13,34 @@ from model.inference.mesh import Mesh, extents, transformed
 BOX_MARGIN_MM = 6.0
 
 
-def surface_of(model: ShapeModel, latent: Float[np.ndarray, "d"], pose: Pose, step_mm: float | None = None) -> Mesh:
+def surface_of(
+    model: ShapeModel,
+    latent: Float[np.ndarray, "d"],
+    pose: Pose,
+    step_mm: float | None = None,
+    discrepancy: Discrepancy | None = None,
+) -> Mesh:
     """Watertight surface in world mm, extracted in the canonical frame so that it turns with its input.
 
     Args:
         latent: (d,) latent code.
         pose: world to canonical.
         step_mm: grid step in world mm; the model's own when None.
+        discrepancy: added to the decoder's field.
     """
     half = canonical_box(model)
     step = (step_mm or model.manifest.resolution_mm) * float(np.exp(pose.log_scale))
 
     def field(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        return np.asarray(model.decoder.logits(latent[None], points[None])[0])
+        logits = model.decoder.logits(latent[None], points[None])[0]
+        return logits if discrepancy is None else discrepancy.corrected(logits, points)
 
     def gradient(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
         logits, _, by_point = model.decoder.logits_and_jacobians(latent[None], points[None])
-        return logits[0], by_point[0]
+        if discrepancy is None:
+            return logits[0], by_point[0]
+        slopes = discrepancy.shrinkage(logits[0])[:, None] * by_point[0]
+        return discrepancy.corrected(logits[0], points), slopes + discrepancy.slope * discrepancy.gradient(points)
 
     mesh = extract_surface(field, -half, half, step, gradient=gradient)
     affine = np.eye(4)

@@ -1,7 +1,7 @@
 """From the posterior to what users read: probability and entropy of voxels, SD of the surface, intervals.
 
-All spread on the surface comes from one matrix of displacement factors ``F`` (v, k): the outward movements of the
-vertices have covariance ``F F^T`` (mm^2), by the Laplace posterior or over an ensemble.
+All spread on the surface comes from `SurfaceSpread`: the covariance of the vertices' outward movements, by the Laplace
+posterior over code, pose and discrepancy, or over an ensemble.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,9 @@ from model.inference.posterior import (
     logit_variance,
     mean_probability,
     normal_displacements,
+    open_variance,
 )
+from model.inference.spread import LocalSpread, SurfaceSpread
 from model.inference.surface import canonical_box
 
 #: Two-sided 90 % quantile of the normal distribution.
@@ -56,34 +58,42 @@ class ShapeState:
         return self.fits[1:]
 
 
-def displacement_factors(model: ShapeModel, state: ShapeState, mesh: Mesh) -> Float[np.ndarray, "v k"] | None:
-    """Factors of the covariance of the vertices' outward movement (mm), or None without uncertainty."""
+def surface_spread(model: ShapeModel, state: ShapeState, mesh: Mesh) -> SurfaceSpread | None:
+    """Posterior of the vertices' outward movement, or None without uncertainty."""
+    found = state.fits[0]
     if state.covariance is not None:
-        _, by_parameter, by_point = fitted_jacobians(model, state.fits[0], mesh.vertices)
-        factor = np.linalg.cholesky(state.covariance)
-        return normal_displacements(by_parameter, by_point) @ factor
+        _, by_parameter, by_point = fitted_jacobians(model, found, mesh.vertices)
+        factors = normal_displacements(by_parameter, by_point) @ np.linalg.cholesky(state.covariance)
+        return SurfaceSpread(factors, _local_spread(found, mesh, by_point))
     if state.members:
-        _, _, by_point = fitted_jacobians(model, state.fits[0], mesh.vertices)
+        _, _, by_point = fitted_jacobians(model, found, mesh.vertices)
         logits = np.stack([fitted_logits(model, member, mesh.vertices) for member in state.members], axis=1)
         moves = normal_displacements(logits, by_point)
-        return np.asarray((moves - moves.mean(axis=1, keepdims=True)) / np.sqrt(len(state.members) - 1))
+        return SurfaceSpread((moves - moves.mean(axis=1, keepdims=True)) / np.sqrt(len(state.members) - 1))
     return None
 
 
-def volume_estimate(mesh: Mesh, factors: Float[np.ndarray, "v k"] | None) -> Estimate:
+def _local_spread(found: Fit, mesh: Mesh, by_point: Float[np.ndarray, "v 3"]) -> LocalSpread | None:
+    if found.discrepancy is None:
+        return None
+    reach = normal_displacements(np.full((len(by_point), 1), found.discrepancy.slope), by_point)[:, 0]
+    return LocalSpread(found.discrepancy, found.pose.to_canonical(mesh.vertices), reach)
+
+
+def volume_estimate(mesh: Mesh, spread: SurfaceSpread | None) -> Estimate:
     """Enclosed volume (mL); a vertex that moves out by 1 mm adds its area."""
-    return _estimate(volume_ml(mesh), vertex_areas(mesh) / 1000.0, factors)
+    return _estimate(volume_ml(mesh), vertex_areas(mesh) / 1000.0, spread)
 
 
-def area_estimate(mesh: Mesh, factors: Float[np.ndarray, "v k"] | None) -> Estimate:
+def area_estimate(mesh: Mesh, spread: SurfaceSpread | None) -> Estimate:
     """Surface area (cm^2)."""
-    return _estimate(area_cm2(mesh), np.sum(area_gradient(mesh) * mesh.normals, axis=1) / 100.0, factors)
+    return _estimate(area_cm2(mesh), np.sum(area_gradient(mesh) * mesh.normals, axis=1) / 100.0, spread)
 
 
-def _estimate(value: float, slope: Float[np.ndarray, "v"], factors: Float[np.ndarray, "v k"] | None) -> Estimate:
-    if factors is None:
+def _estimate(value: float, slope: Float[np.ndarray, "v"], spread: SurfaceSpread | None) -> Estimate:
+    if spread is None:
         return Estimate(value, None, None)
-    reach = NINETY_PERCENT * float(np.linalg.norm(slope @ factors))
+    reach = NINETY_PERCENT * spread.sd_of(slope)
     return Estimate(value, max(0.0, value - reach), value + reach)
 
 
@@ -104,8 +114,10 @@ def _probabilities(model: ShapeModel, state: ShapeState, points: Float[np.ndarra
     result = _sigmoid(logits)
     open_points = np.abs(logits) < SATURATED_LOGIT
     if state.covariance is not None and open_points.any():
-        centre, by_parameter, _ = fitted_jacobians(model, state.fits[0], points[open_points])
-        result[open_points] = mean_probability(centre, logit_variance(by_parameter, state.covariance))
+        found, near = state.fits[0], points[open_points]
+        centre, by_parameter, _ = fitted_jacobians(model, found, near)
+        variance = logit_variance(by_parameter, state.covariance) + open_variance(found, near)
+        result[open_points] = mean_probability(centre, variance)
     return result
 
 

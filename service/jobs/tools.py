@@ -41,7 +41,8 @@ class JobTools:
 def options_of(record: Mapping[str, Any]) -> Options:
     """The choices of a reconstruction request, from a job's argument."""
     annotated = parse_annotated(record["annotated"])
-    return Options(annotated, record["uncertainty"], record["mirror"], record["resolution_mm"], record["seed"])
+    choices = record["uncertainty"], record["mirror"], record["resolution_mm"], record["seed"]
+    return Options(annotated, *choices, record.get("fidelity"))
 
 
 def labels_of(record: Mapping[str, Any]) -> frozenset[int] | None:

@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 from model.geometry import POSE_SIZE, Pose
 from model.inference.fitting import Fit, FitOptions, FitStatus, fit, starting_poses
+from model.inference.objective import Objective
 from model.inference.posterior import (
     CHUNK,
     fitted_jacobians,

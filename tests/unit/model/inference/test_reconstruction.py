@@ -9,22 +9,19 @@ from hypothesis import strategies as st
 
 from model.errors import InvalidMask, InvalidParameter
 from model.geometry import Grid, Pose
-from model.inference.fitting import FitOptions, fit
 from model.inference.mesh import area_cm2, is_watertight, volume_ml
 from model.inference.observations import MaskStack, Plane, section_of
-from model.inference.posterior import fitted_jacobians, fitted_logits
+from model.inference.posterior import fitted_jacobians
 from model.inference.reconstruction import (
     ATYPICAL_PERCENTILE,
     OBSERVATION_BUDGET,
     Options,
-    disagreeing_planes,
     reconstruct,
     typicality,
 )
-from model.inference.reconstruction import _sections as sections_of
 from tests.analytic_model import EllipsoidDecoder, bent_model, ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
-from tests.drawn_shapes import ORTHOGONAL, PARALLEL, DecodedShape, cube_around, drawn, observed, rotation
+from tests.drawn_shapes import ORTHOGONAL, PARALLEL, DecodedShape, cube_around, drawn, rotation
 
 CENTRE = np.array([30.0, -20.0, 50.0])
 MODEL, BENT = ellipsoid_model(), bent_model()
@@ -232,10 +229,7 @@ def test_the_wrong_slice_among_five_is_named(wrong):
     answer = reconstructed(replace(stack, foreground=foreground), annotated=PARALLEL)
     apart = [sentence for sentence in answer.warnings if "disagrees" in sentence]
     assert len(apart) == 1
-    named = [plane.index for plane in PARALLEL if f"mask[0] axis 2 index {plane.index}" in apart[0]]
-    assert PARALLEL[wrong].index in named
-    if wrong in (0, 2, 4):
-        assert named == [PARALLEL[wrong].index]
+    assert [plane for plane in PARALLEL if f"mask[0] axis 2 index {plane.index}" in apart[0]] == [PARALLEL[wrong]]
 
 
 @pytest.mark.parametrize("axes", [(24.0, 5.0, 13.0), (20.0, 15.5, 4.0)])
@@ -262,28 +256,6 @@ def test_typicality_is_the_share_of_the_population_below():
         percentiles.append(percentile)
     assert sorted(percentiles) == pytest.approx(100.0 * np.arange(64) / 64)
     assert typicality(MODEL, replace(found, latent=np.zeros(3)))[1] == 100.0
-
-
-def test_disagreement_is_one_minus_dice():
-    observations = observed(drawn(ELLIPSOID, cube_around(CENTRE)))
-    found = fit(MODEL, observations, FitOptions())
-    shifted = replace(found, pose=replace(found.pose, position=found.pose.position + np.array([2.0, 1.0, 0.0])))
-    inside = fitted_logits(MODEL, shifted, observations.points) > 0
-    for section in sections_of(MODEL, shifted, observations):
-        here = observations.plane_of == observations.planes.index(section.plane)
-        weights, label, shape = observations.weights[here], observations.labels[here] > 0, inside[here]
-        dice = 2 * weights[label & shape].sum() / (weights[label].sum() + weights[shape].sum())
-        assert section.disagreement == pytest.approx(1.0 - dice)
-        assert section.wrong == pytest.approx(weights[label ^ shape].sum())
-
-
-def test_planes_without_observations_are_left_out():
-    observations = observed(drawn(ELLIPSOID, cube_around(CENTRE)))
-    found = fit(MODEL, observations, FitOptions())
-    wider = replace(observations, planes=(*ORTHOGONAL, Plane(0, 2, 3), Plane(0, 2, 4)))
-    sections = sections_of(MODEL, found, wider)
-    assert tuple(section.plane for section in sections) == ORTHOGONAL
-    assert disagreeing_planes(sections) == []
 
 
 def test_empty_planes_that_stay_empty_agree():

@@ -24,8 +24,8 @@ from model.inference.uncertainty import (
     Estimate,
     ShapeState,
     area_estimate,
-    displacement_factors,
     occupancy,
+    surface_spread,
     volume_estimate,
     voxel_entropy,
 )
@@ -71,11 +71,11 @@ def fitted_covariance():
 
 @pytest.mark.parametrize("covariance", [covariance_of(latent=(0.1, 0.2, 0.05), scale=0.01), fitted_covariance()])
 def test_intervals_are_those_of_draws_from_the_posterior(covariance):
-    factors = displacement_factors(MODEL, ShapeState((FIT,), covariance), MESH)
+    spread = surface_spread(MODEL, ShapeState((FIT,), covariance), MESH)
     shapes = [ellipsoid_of(moved(step)) for step in parameter_draws(covariance, 4000, seed=0)]
     for estimate, drawn_figures in (
-        (volume_estimate(MESH, factors), [shape.volume_ml for shape in shapes]),
-        (area_estimate(MESH, factors), [shape.area_cm2 for shape in shapes]),
+        (volume_estimate(MESH, spread), [shape.volume_ml for shape in shapes]),
+        (area_estimate(MESH, spread), [shape.area_cm2 for shape in shapes]),
     ):
         assert half_width(estimate) == pytest.approx(NINETY_PERCENT * np.std(drawn_figures), rel=0.06)
         low, high = np.quantile(drawn_figures, [0.05, 0.95])
@@ -84,12 +84,12 @@ def test_intervals_are_those_of_draws_from_the_posterior(covariance):
 
 def test_intervals_are_those_of_meshes_of_draws():
     covariance = covariance_of(latent=(0.1, 0.2, 0.05), position=0.5, rotation=0.1, scale=0.01)
-    factors = displacement_factors(MODEL, ShapeState((FIT,), covariance), MESH)
+    spread = surface_spread(MODEL, ShapeState((FIT,), covariance), MESH)
     fits = [moved(step) for step in parameter_draws(covariance, 200, seed=0)]
     meshes = [surface_of(MODEL, each.latent, each.pose, 1.5) for each in fits]
-    for estimate, figure in ((volume_estimate(MESH, factors), volume_ml), (area_estimate(MESH, factors), area_cm2)):
-        spread = np.std([figure(mesh) for mesh in meshes])
-        assert half_width(estimate) == pytest.approx(NINETY_PERCENT * spread, rel=0.15)
+    for estimate, figure in ((volume_estimate(MESH, spread), volume_ml), (area_estimate(MESH, spread), area_cm2)):
+        drawn_sd = np.std([figure(mesh) for mesh in meshes])
+        assert half_width(estimate) == pytest.approx(NINETY_PERCENT * drawn_sd, rel=0.15)
 
 
 def test_surface_spread_of_each_parameter():
@@ -103,15 +103,15 @@ def test_surface_spread_of_each_parameter():
         ),
     }
     for name, (expected, covariance) in spreads.items():
-        factors = displacement_factors(MODEL, ShapeState((FIT,), covariance), MESH)
-        np.testing.assert_allclose(np.linalg.norm(factors, axis=1), expected, rtol=0.01, atol=1e-3, err_msg=name)
+        spread = surface_spread(MODEL, ShapeState((FIT,), covariance), MESH)
+        np.testing.assert_allclose(spread.sd(), expected, rtol=0.01, atol=1e-3, err_msg=name)
 
 
 def test_moving_a_shape_changes_no_figure():
     covariance = covariance_of(position=1.0, rotation=0.1)
-    factors = displacement_factors(MODEL, ShapeState((FIT,), covariance), MESH)
-    assert half_width(volume_estimate(MESH, factors)) < 2e-3 * volume_ml(MESH)
-    assert half_width(area_estimate(MESH, factors)) < 5e-3 * area_cm2(MESH)
+    spread = surface_spread(MODEL, ShapeState((FIT,), covariance), MESH)
+    assert half_width(volume_estimate(MESH, spread)) < 2e-3 * volume_ml(MESH)
+    assert half_width(area_estimate(MESH, spread)) < 5e-3 * area_cm2(MESH)
 
 
 def test_ensemble_spread_is_that_of_its_members():
@@ -119,34 +119,34 @@ def test_ensemble_spread_is_that_of_its_members():
     members = tuple(
         replace(FIT, pose=Pose(CENTRE + np.array([s, 0.0, 0.0]), POSE.rotation, 0.1, mirrored=True)) for s in shifts
     )
-    factors = displacement_factors(MODEL, ShapeState((FIT, *members), None), MESH)
+    spread = surface_spread(MODEL, ShapeState((FIT, *members), None), MESH)
     expected = np.std(shifts, ddof=1) * np.abs(MESH.normals[:, 0])
-    np.testing.assert_allclose(np.linalg.norm(factors, axis=1), expected, rtol=0.02, atol=3e-4)
+    np.testing.assert_allclose(spread.sd(), expected, rtol=0.02, atol=3e-4)
 
 
 def test_ensemble_interval_is_that_of_its_volumes():
     steps = parameter_draws(covariance_of(latent=(0.1, 0.2, 0.05)), 24, seed=3)
     members = tuple(moved(step) for step in steps)
-    factors = displacement_factors(MODEL, ShapeState((FIT, *members), None), MESH)
-    spread = np.std([ellipsoid_of(member).volume_ml for member in members], ddof=1)
-    assert half_width(volume_estimate(MESH, factors)) == pytest.approx(NINETY_PERCENT * spread, rel=0.1)
+    spread = surface_spread(MODEL, ShapeState((FIT, *members), None), MESH)
+    of_members = np.std([ellipsoid_of(member).volume_ml for member in members], ddof=1)
+    assert half_width(volume_estimate(MESH, spread)) == pytest.approx(NINETY_PERCENT * of_members, rel=0.1)
 
 
 def test_no_intervals_without_uncertainty():
-    assert displacement_factors(MODEL, ShapeState((FIT,), None), MESH) is None
+    assert surface_spread(MODEL, ShapeState((FIT,), None), MESH) is None
     assert volume_estimate(MESH, None) == Estimate(volume_ml(MESH), None, None)
     assert area_estimate(MESH, None) == Estimate(area_cm2(MESH), None, None)
 
 
 def test_empty_surface_has_empty_factors():
-    factors = displacement_factors(MODEL, ShapeState((FIT,), covariance_of(latent=0.1)), empty_mesh())
-    assert factors.shape == (0, 3 + POSE_SIZE)
-    assert volume_estimate(empty_mesh(), factors) == Estimate(0.0, 0.0, 0.0)
+    spread = surface_spread(MODEL, ShapeState((FIT,), covariance_of(latent=0.1)), empty_mesh())
+    assert spread.factors.shape == (0, 3 + POSE_SIZE)
+    assert volume_estimate(empty_mesh(), spread) == Estimate(0.0, 0.0, 0.0)
 
 
 def test_intervals_do_not_go_below_zero():
-    factors = displacement_factors(MODEL, ShapeState((FIT,), covariance_of(latent=20.0)), MESH)
-    assert volume_estimate(MESH, factors).low == 0.0
+    spread = surface_spread(MODEL, ShapeState((FIT,), covariance_of(latent=20.0)), MESH)
+    assert volume_estimate(MESH, spread).low == 0.0
 
 
 def test_area_gradient_against_differences():
@@ -255,7 +255,6 @@ def test_uncertainty_is_greatest_between_drawn_planes():
     observations = observed(drawn(Ellipsoid((14.0, 9.0, 7.0), CENTRE), cube_around(CENTRE), PARALLEL[:3]), PARALLEL[:3])
     found = fit(MODEL, observations, FitOptions())
     mesh = surface_of(MODEL, found.latent, found.pose, 1.0)
-    factors = displacement_factors(MODEL, ShapeState((found,), laplace_covariance(found)), mesh)
-    spread = np.linalg.norm(factors, axis=1)
+    sd = surface_spread(MODEL, ShapeState((found,), laplace_covariance(found)), mesh).sd()
     drawn_side = mesh.vertices[:, 2] < CENTRE[2]
-    assert spread[~drawn_side].max() > 1.5 * spread[drawn_side].max()
+    assert sd[~drawn_side].max() > 1.5 * sd[drawn_side].max()

@@ -1,0 +1,163 @@
+"""The discrepancy of one fit: where its surface misses the drawn contours, and by how much."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from model.bundle import Manifest, ShapeModel
+from model.inference.discrepancy.contours import contour_points
+from model.inference.discrepancy.covariance import Covariance
+from model.inference.discrepancy.grouping import cells_of, means_of
+from model.inference.discrepancy.process import REACH_MM, Discrepancy
+from model.inference.fitting import Fit
+from model.inference.mask_stack import MaskStack
+from model.inference.observations import Observations
+from model.inference.posterior import model_logits
+from model.inference.surface import canonical_box
+
+#: Contour points this close together (mm) are taken together ...
+CELL_MM = 1.5
+#: ... or farther, so that no more than this many are left.
+MOST_POINTS = 900
+#: Observations on the wrong side of the fitted surface count when they are farther than this from a contour (mm).
+CLEARLY_WRONG_MM = 1.5
+#: Planes are kept this far apart (mm) when distances within them are looked up.
+APART_MM = 1e4
+#: SD of the observations that no fidelity goes below (mm): half a voxel's quantisation.
+LEAST_NOISE_MM = 0.1
+
+
+@dataclass(frozen=True)
+class DiscrepancyPrior:
+    """What is expected of a model's residuals, before a drawing is seen.
+
+    Attributes:
+        spread_mm: SD of the residual at contour points.
+        fidelity: share of its variance that is the shape's and not the annotator's: 0 trusts the model alone, 1 the
+            drawing alone.
+        lengths_mm: of the covariance's terms, which have equal shares.
+    """
+
+    spread_mm: float = 0.6
+    fidelity: float = 0.5
+    lengths_mm: tuple[float, ...] = (2.0, 8.0)
+
+    @property
+    def covariance(self) -> Covariance:
+        """Of the shape's part."""
+        sd = self.spread_mm * float(np.sqrt(self.fidelity / len(self.lengths_mm)))
+        return Covariance((sd,) * len(self.lengths_mm), self.lengths_mm)
+
+    @property
+    def noise_mm(self) -> float:
+        """SD of the annotator's part."""
+        return max(LEAST_NOISE_MM, self.spread_mm * float(np.sqrt(1.0 - self.fidelity)))
+
+
+def discrepancy_prior(manifest: Manifest, fidelity: float | None = None) -> DiscrepancyPrior:
+    """The one calibrated for a model, with another fidelity when it is given."""
+    known = manifest.discrepancy
+    prior = DiscrepancyPrior() if not known else DiscrepancyPrior(known["spread_mm"], known["fidelity"])
+    return prior if fidelity is None else replace(prior, fidelity=fidelity)
+
+
+def with_discrepancy(
+    model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations, prior: DiscrepancyPrior
+) -> Fit:
+    """The fit with its discrepancy, see `discrepancy_of`."""
+    return replace(found, discrepancy=discrepancy_of(model, found, stacks, observations, prior))
+
+
+def discrepancy_of(
+    model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations, prior: DiscrepancyPrior
+) -> Discrepancy | None:
+    """The discrepancy given the drawn contours; None where the model alone is trusted or nothing was drawn.
+
+    Observed are contour points (the surface runs there) and observations far on the wrong side of the fitted surface
+    (it is elsewhere). Planes that the fit left out are left out.
+    """
+    if prior.fidelity <= 0.0:
+        return None
+    seen = _within(_evidence(model, found, stacks, observations), found, canonical_box(model))
+    if not len(seen.distances):
+        return None
+    canonical = found.pose.to_canonical(seen.points)
+    logits, by_latent, by_point = (
+        part[0] for part in model.decoder.logits_and_jacobians(found.latent[None], canonical[None])
+    )
+    slope = float(np.median(np.linalg.norm(by_point, axis=1)))
+    levels = np.tanh(logits / (REACH_MM * slope))
+    by_parameter = np.concatenate([by_latent, found.pose.jacobian(canonical, by_point)], axis=1)
+    return Discrepancy(
+        points=canonical,
+        residuals=REACH_MM * (np.tanh(seen.distances / REACH_MM) - levels),
+        jacobian=by_parameter * ((1.0 - np.square(levels)) / slope)[:, None],
+        covariance=prior.covariance,
+        noise_mm=prior.noise_mm,
+        slope=slope,
+        half_extent=canonical_box(model),
+    )
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """World points (mm) and their signed distances from the drawn contour (mm, positive inside)."""
+
+    points: Float[np.ndarray, "n 3"]
+    distances: Float[np.ndarray, "n"]
+
+
+def _within(evidence: _Evidence, found: Fit, half: Float[np.ndarray, "3"]) -> _Evidence:
+    inside = (np.abs(found.pose.to_canonical(evidence.points)) <= half).all(axis=1)
+    return _Evidence(evidence.points[inside], evidence.distances[inside])
+
+
+def _evidence(model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations) -> _Evidence:
+    """Contour points, at distance 0, and what lies clearly on the wrong side, both thinned out."""
+    trusted = np.ones(len(observations.planes), bool) if found.plane_weights is None else found.plane_weights > 0
+    contour, plane_of = contour_points(stacks, observations.planes)
+    used = trusted[plane_of]
+    contour, plane_of = contour[used], plane_of[used]
+    wrong = _wrong_side(model, found, observations, trusted, contour, plane_of)
+    points = np.concatenate([contour, wrong.points])
+    if not len(points):
+        return wrong
+    kinds = np.concatenate([2 * plane_of, np.ones(len(wrong.distances), int)])
+    cells = _few_cells(found.pose.to_canonical(points), kinds)
+    distances = np.concatenate([np.zeros(len(contour)), wrong.distances])
+    return _Evidence(means_of(cells, points), means_of(cells, distances[:, None])[:, 0])
+
+
+def _wrong_side(
+    model: ShapeModel,
+    found: Fit,
+    observations: Observations,
+    trusted: Bool[np.ndarray, "k"],
+    contour: Float[np.ndarray, "n 3"],
+    plane_of: Int[np.ndarray, "n"],
+) -> _Evidence:
+    """Observations that the fit has on the wrong side of its surface, clearly so by their distance in the plane."""
+    inside = observations.labels > 0
+    wrong = np.flatnonzero(
+        ((model_logits(model, found, observations.points) > 0) != inside) & trusted[observations.plane_of]
+    )
+    if not (wrong.size and len(contour)):
+        return _Evidence(np.zeros((0, 3)), np.zeros(0))
+    apart = APART_MM * plane_of[:, None], APART_MM * observations.plane_of[wrong][:, None]
+    tree = cKDTree(np.hstack([contour, apart[0]]))
+    distance, _ = tree.query(np.hstack([observations.points[wrong], apart[1]]))
+    clear = (distance > CLEARLY_WRONG_MM) & (distance < APART_MM)
+    chosen = wrong[clear]
+    return _Evidence(observations.points[chosen], np.where(inside[chosen], distance[clear], -distance[clear]))
+
+
+def _few_cells(points: Float[np.ndarray, "n 3"], kinds: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    size = CELL_MM
+    while True:
+        cells = cells_of(points, size, kinds)
+        if cells.max() < MOST_POINTS:
+            return cells
+        size *= 1.15

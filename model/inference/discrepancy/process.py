@@ -1,0 +1,151 @@
+"""What the drawn contours show and the latent code cannot express: a Gaussian process added to the fitted field.
+
+Near the surface the fitted logit ``l`` tells how far (mm) a point is from it: ``m = C tanh(l / (C g))`` with ``g`` the
+field's slope there (1/mm) and ``C`` a distance beyond which nothing more is said. The field that is reconstructed is
+
+    F(u) = g (m(u) + delta(u)),     delta ~ GP(0, k),     m(c) + delta(c) = 0 + noise at drawn contour points c,
+
+so that its surface runs through the drawn contours to within the annotator's noise and is the model's own away from
+them (a discrepancy in the sense of Kennedy and O'Hagan, 2001). All in the canonical frame.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.ndimage import map_coordinates, spline_filter
+
+from model.inference.discrepancy.covariance import Axes, Covariance
+from model.inference.discrepancy.grouping import cells_of, means_of
+
+#: ``C``: distances from the surface count up to about this (mm).
+REACH_MM = 3.0
+#: Steps of the lattice that holds the process, of its shortest length.
+LATTICE_STEPS = 2.0
+#: Half step of the differences that give the gradient (mm).
+DIFFERENCE_MM = 0.2
+#: Size of the cells whose points are taken together in a functional, in shortest lengths.
+GROUP_SHARE = 0.8
+#: Evaluations of the covariance in one piece; bounds memory.
+PIECE = 1 << 22
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """The process, conditioned on contours.
+
+    Attributes:
+        points: (n, 3) canonical mm.
+        residuals: (n,) what the process was observed to be there (mm).
+        jacobian: (n, p) derivatives of ``m`` by (latent, pose step) there.
+        covariance: of the process before it saw the contours (mm^2).
+        noise_mm: SD of the observations.
+        slope: ``g`` (1/mm).
+        half_extent: half size of the canonical box in which the process is known (mm).
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    residuals: Float[np.ndarray, "n"]
+    jacobian: Float[np.ndarray, "n p"]
+    covariance: Covariance
+    noise_mm: float
+    slope: float
+    half_extent: Float[np.ndarray, "3"]
+
+    def corrected(self, logits: Float[np.ndarray, "m"], canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
+        """``F`` where the decoder gives these logits."""
+        scale = REACH_MM * self.slope
+        return np.asarray(scale * np.tanh(logits / scale) + self.slope * self.mean(canonical))
+
+    def shrinkage(self, logits: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """Derivative of ``g m`` by the logit."""
+        return np.asarray(1.0 - np.square(np.tanh(logits / (REACH_MM * self.slope))))
+
+    def mean(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
+        """Posterior mean (mm); 0 outside the box."""
+        return np.asarray(map_coordinates(self._splines, self._places(canonical), order=3, prefilter=False))
+
+    def gradient(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+        """Gradient of the posterior mean, by central differences."""
+        steps = DIFFERENCE_MM * np.eye(3)
+        changes = [self.mean(canonical + step) - self.mean(canonical - step) for step in steps]
+        return np.asarray(np.stack(changes, axis=1) / (2.0 * DIFFERENCE_MM))
+
+    def variance(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
+        """Posterior variance (mm^2)."""
+        result = np.empty(len(canonical))
+        for piece in self._pieces(len(canonical)):
+            seen = self._explained(canonical[piece])
+            result[piece] = self.covariance.variance - np.square(seen).sum(axis=0)
+        return np.maximum(result, 0.0)
+
+    def carried(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m p"]:
+        """How far the process gives way (mm) when a parameter moves the model, for a unit of each parameter.
+
+        The contours hold the surface: what a parameter adds to ``m`` at them, the process takes back around them.
+        """
+        result = np.empty((len(canonical), self.jacobian.shape[1]), np.float32)
+        for piece in self._pieces(len(canonical)):
+            result[piece] = self.covariance.between(canonical[piece], self.points) @ self._moves
+        return result
+
+    def functional_variance(self, canonical: Float[np.ndarray, "m 3"], weights: Float[np.ndarray, "m"]) -> float:
+        """Posterior variance of ``sum_m weights_m delta(u_m)`` (square of the weights' unit times mm^2).
+
+        Points closer than the process can tell apart are taken together.
+        """
+        cells = cells_of(canonical, GROUP_SHARE * min(self.covariance.lengths))
+        total = np.bincount(cells, weights)
+        centres = means_of(cells, canonical)
+        before = float(total @ (self.covariance.between(centres, centres) @ total))
+        return max(0.0, before - float(np.square(self._explained(centres) @ total).sum()))
+
+    @cached_property
+    def _factor(self) -> tuple[Float[np.ndarray, "n n"], bool]:
+        gram = self.covariance.between(self.points, self.points).astype(float)
+        gram[np.diag_indices_from(gram)] += self.noise_mm**2 + 1e-5 * self.covariance.variance
+        factor, lower = cho_factor(gram, lower=True)
+        return np.asarray(factor), bool(lower)
+
+    @cached_property
+    def _whitener(self) -> Float[np.ndarray, "n n"]:
+        """Inverse of the Cholesky factor of the observations' covariance, in single precision."""
+        identity = np.eye(len(self.points))
+        return np.asarray(solve_triangular(self._factor[0], identity, lower=True), np.float32)
+
+    @cached_property
+    def _moves(self) -> Float[np.ndarray, "n p"]:
+        return np.asarray(cho_solve(self._factor, self.jacobian.astype(float)), np.float32)
+
+    @cached_property
+    def _axes(self) -> Axes:
+        step = min(self.covariance.lengths) / LATTICE_STEPS
+        counts = np.ceil(2.0 * self.half_extent / step).astype(int) + 1
+        x, y, z = (np.linspace(-half, half, count) for half, count in zip(self.half_extent, counts, strict=True))
+        return x, y, z
+
+    @cached_property
+    def _nodes(self) -> Float[np.ndarray, "i j k"]:
+        """Posterior mean on the lattice (mm)."""
+        weights = cho_solve(self._factor, self.residuals.astype(float))
+        return self.covariance.summed_on(self._axes, self.points, weights)
+
+    @cached_property
+    def _splines(self) -> Float[np.ndarray, "i j k"]:
+        return np.asarray(spline_filter(self._nodes, order=3, output=np.float32))
+
+    def _places(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "3 m"]:
+        """Points in steps of the lattice."""
+        steps = np.array([axis[1] - axis[0] for axis in self._axes])
+        return np.ascontiguousarray(((canonical + self.half_extent) / steps).T)
+
+    def _explained(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "n m"]:
+        """Factor of the covariance that the contours explain."""
+        return np.asarray(self._whitener @ self.covariance.between(self.points, canonical))
+
+    def _pieces(self, count: int) -> Iterator[slice]:
+        step = max(1, PIECE // len(self.points))
+        return (slice(start, start + step) for start in range(0, count, step))

@@ -1,0 +1,51 @@
+"""Posterior of the surface's movement along its normal, to first order."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from model.inference.discrepancy.process import Discrepancy
+
+
+@dataclass(frozen=True)
+class LocalSpread:
+    """What the discrepancy leaves open at the vertices.
+
+    Attributes:
+        discrepancy: the process.
+        canonical: (v, 3) vertices (canonical mm).
+        reach: (v,) outward movement (mm) of a vertex for one mm of the process.
+    """
+
+    discrepancy: Discrepancy
+    canonical: Float[np.ndarray, "v 3"]
+    reach: Float[np.ndarray, "v"]
+
+
+@dataclass(frozen=True)
+class SurfaceSpread:
+    """Covariance of the vertices' outward movements (mm^2): ``F F^T`` and that of the discrepancy.
+
+    Attributes:
+        factors: (v, k) ``F``, by the Laplace posterior over code and pose, or over an ensemble.
+        local: the discrepancy's share, None without one.
+    """
+
+    factors: Float[np.ndarray, "v k"]
+    local: LocalSpread | None = None
+
+    def sd(self) -> Float[np.ndarray, "v"]:
+        """SD of each vertex (mm)."""
+        variance = np.square(self.factors).sum(axis=1)
+        if self.local is not None:
+            variance = variance + np.square(self.local.reach) * self.local.discrepancy.variance(self.local.canonical)
+        return np.sqrt(variance)
+
+    def sd_of(self, slope: Float[np.ndarray, "v"]) -> float:
+        """SD of a figure that changes by ``slope_v`` for a mm of outward movement of vertex v."""
+        variance = float(np.square(slope @ self.factors).sum())
+        if self.local is not None:
+            reach = slope * self.local.reach
+            variance += self.local.discrepancy.functional_variance(self.local.canonical, reach)
+        return float(np.sqrt(variance))
