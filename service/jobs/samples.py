@@ -11,7 +11,7 @@ from service.jobs.tools import JobTools
 from service.ports import SAMPLES_JOB, SampleFormat
 
 #: A job is cut into about so many parts, of so many shapes at least and at most.
-_PARTS, _FEWEST, _MOST = 256, 4, 64
+_PARTS, _FEWEST, _MOST = 96, 4, 64
 
 
 def samples_kind(tools: JobTools) -> JobKind:
