@@ -1,57 +1,87 @@
-"""How much a drawn mm^2 is worth: the likelihood precision, chosen on validation shapes.
+"""How much a drawn mm^2 is worth and how far the slices are followed: chosen on validation shapes.
 
-Neighbouring voxels are not independent, so the sum of their log likelihoods overstates what a slice tells. Each
-candidate is judged by the cross-entropy of the posterior mean occupancy on voxels near the true surface: a proper
-score, lowest where the fit is accurate and its uncertainty honest.
+Neighbouring voxels are not independent, so the sum of their log likelihoods overstates what a slice tells
+(likelihood precision), and what the code leaves unexplained at a contour is partly the shape's, partly the annotator's
+(spread and fidelity of the discrepancy). Each candidate is judged by the cross-entropy of the posterior mean occupancy
+on voxels near the true surface: a proper score, lowest where the fit is accurate and its uncertainty honest.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from model.bundle import ShapeModel, open_bundle, write_manifest
-from model.inference.fitting import FitOptions, fit
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
+from model.inference.fitting import Fit, FitOptions, fit
 from model.inference.observations import observe
-from model.inference.posterior import fitted_jacobians, laplace_covariance, logit_variance, mean_probability
+from model.inference.posterior import (
+    fitted_jacobians,
+    laplace_covariance,
+    logit_variance,
+    mean_probability,
+    open_variance,
+)
 from model.inference.reconstruction import OBSERVATION_BUDGET
 from training.cohorts.cohort import Case, Cohort
 from training.config import Regime
 from training.sparsify import for_evaluation
 
-#: Precisions that are tried (1/mm^2), and the regimes that they are tried on.
-CANDIDATES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8)
+#: Precisions that are tried (1/mm^2), fidelities, spreads (mm), and the regimes that they are tried on.
+PRECISIONS = (0.05, 0.1, 0.2, 0.4, 0.8)
+FIDELITIES = (0.15, 0.3, 0.5, 0.7, 0.85)
+SPREADS_MM = (0.2, 0.35, 0.6, 1.0, 1.7)
 REGIMES: tuple[Regime, ...] = ("orthogonal", "thin", "thick")
-#: Voxels this close to the true surface are scored (mm).
+#: Voxels this close to the true surface are scored (mm), at most so many of a case.
 BAND_MM = 5.0
+SCORED_VOXELS = 4000
+#: Evenly spaced validation cases that are used.
+CASES = 12
 
 Watch = Callable[[float], None]
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """Scores of the candidates and the best of them.
-
-    Attributes:
-        precision: the chosen likelihood precision (1/mm^2).
-        scores: mean cross-entropy (nats a voxel) of each candidate.
-    """
+class Candidate(NamedTuple):
+    """What is chosen together: precision (1/mm^2), fidelity, and spread (mm)."""
 
     precision: float
-    scores: dict[float, float]
+    fidelity: float
+    spread_mm: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The best candidate and the mean cross-entropy (nats a voxel) of each."""
+
+    best: Candidate
+    scores: dict[Candidate, float]
+
+    def best_of(self, field: str) -> dict[float, float]:
+        """Lowest score for each value of one of the fields."""
+        found: dict[float, float] = {}
+        for candidate, value in self.scores.items():
+            key = getattr(candidate, field)
+            found[key] = min(value, found.get(key, np.inf))
+        return found
 
 
 def calibrate(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda precision: None) -> Calibration:
-    """Choose the likelihood precision of a model on cases that it was not trained on."""
-    scores = {}
-    for precision in CANDIDATES:
+    """Choose for a model on cases that it was not trained on."""
+    chosen = cases[:: -(-len(cases) // CASES)]
+    totals: dict[Candidate, list[float]] = {}
+    for precision in PRECISIONS:
         trial = with_precision(model, precision)
-        scores[precision] = float(np.mean([score(trial, case, regime) for case in cases for regime in REGIMES]))
+        for case in chosen:
+            for regime in REGIMES:
+                for candidate, value in scores(trial, case, regime):
+                    totals.setdefault(candidate, []).append(value)
         watch(precision)
-    return Calibration(min(scores, key=scores.__getitem__), scores)
+    means = {candidate: float(np.mean(values)) for candidate, values in totals.items()}
+    return Calibration(min(means, key=means.__getitem__), means)
 
 
 def calibrate_bundle(folder: Path, cohort: Cohort, watch: Watch = lambda precision: None) -> Calibration:
@@ -65,11 +95,17 @@ def calibrate_bundle(folder: Path, cohort: Cohort, watch: Watch = lambda precisi
     facts: dict[str, object] = {
         "cohort": cohort.name,
         "split": "validation",
-        "cases": [case.name for case in cohort.validation],
+        "cases": [case.name for case in cohort.validation[:: -(-len(cohort.validation) // CASES)]],
         "regimes": list(REGIMES),
-        "cross_entropy": {f"{precision:g}": value for precision, value in found.scores.items()},
+        "cross_entropy": {
+            field: {f"{key:g}": value for key, value in found.best_of(field).items()} for field in Candidate._fields
+        },
     }
-    write_manifest(replace(model.manifest, likelihood_precision=found.precision, calibration=facts), folder)
+    discrepancy = {"spread_mm": found.best.spread_mm, "fidelity": found.best.fidelity}
+    changed = replace(
+        model.manifest, likelihood_precision=found.best.precision, discrepancy=discrepancy, calibration=facts
+    )
+    write_manifest(changed, folder)
     return found
 
 
@@ -78,17 +114,32 @@ def with_precision(model: ShapeModel, precision: float) -> ShapeModel:
     return replace(model, manifest=replace(model.manifest, likelihood_precision=precision))
 
 
-def score(model: ShapeModel, case: Case, regime: Regime) -> float:
-    """Cross-entropy (nats a voxel) of the posterior mean occupancy near the true surface."""
+def scores(model: ShapeModel, case: Case, regime: Regime) -> Iterator[tuple[Candidate, float]]:
+    """Cross-entropy (nats a voxel) of the posterior mean occupancy near the true surface, for each candidate."""
     drawing = for_evaluation(case.mask, case.grid, regime)
     observations = observe([drawing.stack], drawing.planes, budget=OBSERVATION_BUDGET, seed=0)
-    found = fit(model, observations, FitOptions())
-    near = near_surface(case.mask, case.grid.spacing)
-    points = case.grid.to_world(np.argwhere(near).astype(float))
+    found = fit(model, observations, FitOptions(robust=False))
+    index = np.argwhere(near_surface(case.mask, case.grid.spacing))
+    index = index[:: -(-len(index) // SCORED_VOXELS)]
+    points, truth = case.grid.to_world(index.astype(float)), case.mask[tuple(index.T)]
+    for fidelity in FIDELITIES:
+        prior = DiscrepancyPrior(1.0, fidelity)
+        corrected = with_discrepancy(model, found, [drawing.stack], observations, prior)
+        for spread, value in _scores_of(model, corrected, points, truth):
+            yield Candidate(model.manifest.likelihood_precision, fidelity, spread), value
+
+
+def _scores_of(
+    model: ShapeModel, found: Fit, points: Float[np.ndarray, "n 3"], truth: Bool[np.ndarray, "n"]
+) -> Iterator[tuple[float, float]]:
+    """Scores by spread: it scales the discrepancy's variance and leaves its mean."""
     logits, by_parameter, _ = fitted_jacobians(model, found, points)
-    probability = mean_probability(logits, logit_variance(by_parameter, laplace_covariance(found)))
-    probability = np.clip(probability.astype(float), 1e-6, 1.0 - 1e-6)
-    return float(-np.mean(np.where(case.mask[near], np.log(probability), np.log1p(-probability))))
+    of_parameters = logit_variance(by_parameter, laplace_covariance(found))
+    of_discrepancy = open_variance(found, points)
+    for spread in SPREADS_MM:
+        probability = mean_probability(logits, of_parameters + spread**2 * of_discrepancy).astype(float)
+        probability = np.clip(probability, 1e-6, 1.0 - 1e-6)
+        yield spread, float(-np.mean(np.where(truth, np.log(probability), np.log1p(-probability))))
 
 
 def near_surface(mask: Bool[np.ndarray, "i j k"], spacing: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "i j k"]:

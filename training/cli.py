@@ -102,19 +102,28 @@ def calibrate(
     shippable: ShippableOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Choose on validation shapes how much a drawn mm^2 is worth, and record it in the bundle."""
+    """Choose on validation shapes how much a drawn mm^2 is worth and how far slices are followed; record both."""
     with exit_status():
-        from training.calibration import CANDIDATES, calibrate_bundle
+        from training.calibration import PRECISIONS, Candidate, calibrate_bundle
 
         options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
         found = open_cohort(cohort, masks, data, options, labels=tuple(label or ()))
         if not found.validation:
             raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
-        with progress(len(CANDIDATES), f"calibrating on {found.name}") as bar:
+        with progress(len(PRECISIONS), f"calibrating on {found.name}") as bar:
             chosen = calibrate_bundle(bundle, found, lambda precision: bar.advance(bar.task_ids[0]))
-        scores = ", ".join(f"{precision:g}: {value:.4f}" for precision, value in chosen.scores.items())
-        summary = {"likelihood_precision": chosen.precision, "scores": chosen.scores}
-        words = f"likelihood precision {chosen.precision:g} per mm^2 (cross-entropy by candidate: {scores})"
+        best = chosen.best
+        scores = {field: chosen.best_of(field) for field in Candidate._fields}
+        summary = {
+            "likelihood_precision": best.precision,
+            "fidelity": best.fidelity,
+            "spread_mm": best.spread_mm,
+            "cross_entropy": scores,
+        }
+        words = (
+            f"likelihood precision {best.precision:g} per mm^2, fidelity {best.fidelity:g}, "
+            f"spread {best.spread_mm:g} mm (lowest cross-entropy {chosen.scores[best]:.4f} nats a voxel)"
+        )
         typer.echo(json.dumps(summary) if as_json else words)
 
 
