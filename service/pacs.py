@@ -58,7 +58,7 @@ def open_pacs(settings: Settings, file: Path, blobs: BlobStore, jobs: JobEngine,
 
 def silence_libraries() -> None:
     """Nothing that a library would log or warn of leaves the process: it holds values of headers."""
-    warnings.filterwarnings("ignore", module=r"(pydicom|pynetdicom|highdicom|dicomweb_client)\b")
+    warnings.filterwarnings("ignore", module=r"(pydicom|pynetdicom|highdicom|dicomweb_client|service)\b")
     for name in TALKATIVE:
         logger = logging.getLogger(name)
         logger.addHandler(logging.NullHandler())

@@ -5,9 +5,10 @@ meets what a stranger sent. Deflated data sets are refused, since they would be 
 size is known.
 """
 
+import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import BinaryIO
 
 import numpy as np
@@ -54,12 +55,32 @@ def read_object(file: BinaryIO, part: str) -> Dataset:
         return dcmread(file)
 
 
-@contextmanager
-def quiet() -> Iterator[None]:
-    """No warnings about values: they hold them."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+class _Quiet:
+    """Warnings off while any thread asks for it: their filters are of the whole process."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = 0
+        self._scope = ExitStack()
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        with self._lock:
+            self._users += 1
+            if self._users == 1:
+                self._scope.enter_context(warnings.catch_warnings())
+                warnings.simplefilter("ignore")
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users -= 1
+                if self._users == 0:
+                    self._scope.close()
+
+
+#: No warnings about values within: they hold them.
+quiet = _Quiet()
 
 
 @contextmanager

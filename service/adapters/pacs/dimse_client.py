@@ -99,7 +99,7 @@ class DimseArchive:
         query.QueryRetrieveLevel = "IMAGE"
         for name in ("StudyInstanceUID", "SeriesInstanceUID", "SOPInstanceUID"):
             setattr(query, name, found[name].value)
-        answers = peer.send_c_find(query, sop_classes.FIND)
+        answers = list(peer.send_c_find(query, sop_classes.FIND))  # to the last, or the next query meets the rest
         return any(status.get("Status") in PENDING for status, _ in answers)
 
     def _is_committed(self, objects: Sequence[Dataset]) -> bool:
