@@ -54,7 +54,7 @@ def serving(models: tuple[Path, ...], settings: Mapping[str, str] | None = None)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
-    with tempfile.TemporaryDirectory() as results:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as results:
         environment = {
             **os.environ,
             "MORPHOFLOW_RESULTS_FOLDER": str(Path(results) / "results"),

@@ -20,6 +20,7 @@ from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobState, JobStatus
 from service.job_presentation import job_summary
 from service.job_results import write_zip
+from service.job_submission import JobDesk
 from service.jobs.reconstructions import zip_of_folder
 from service.jobs.worker import supervised_workers
 from service.model_registry import pinned_name
@@ -136,10 +137,8 @@ def _begin(
     as_json: bool,
 ) -> None:
     jobs, blobs = open_jobs(settings), open_blobs(settings)
-    identifier = jobs.new_id(kind, key)
-    if archive is not None:
-        JobFiles(blobs, identifier).put_input(0, archive)
-    status = jobs.enqueue(kind, argument, identifier)
+    inputs = () if archive is None else (archive,)
+    status = JobDesk(jobs, blobs, settings.max_jobs).submit(kind, argument, inputs, key)
     if output is None:
         _tell(status, as_json=as_json)
         return

@@ -4,6 +4,7 @@ A folder is written under a temporary name and renamed, so a reader or a restart
 one. Deleting renames first as well. Expired results are never served, even before they are swept.
 """
 
+import errno
 import re
 import shutil
 import threading
@@ -22,6 +23,7 @@ _IDENTIFIER = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}\Z")
 _TEMPORARY = ".tmp-"
 #: A temporary folder older than this (s) belongs to a program that is gone.
 _ABANDONED_AFTER_S = 3600.0
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 
 class DiskResultStore:
@@ -56,8 +58,10 @@ class DiskResultStore:
                 self._remove(self._folder / identifier)
                 self._make_room(_size(temporary))
                 temporary.rename(self._folder / identifier)
-        except BaseException:
+        except BaseException as fault:
             shutil.rmtree(temporary, ignore_errors=True)
+            if isinstance(fault, OSError) and fault.errno in _NO_ROOM:
+                raise StoreFull("The disk has no room for the result; send the request again later.") from fault
             raise
         return StoredResult(identifier, _moment(now), _moment(times["expires"]), outcome)
 

@@ -1,7 +1,5 @@
 """How requests become jobs: idempotency, a bound on their number, and the answer 202."""
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -9,16 +7,13 @@ from fastapi import Header, Request
 from starlette.responses import JSONResponse, Response
 
 from model.errors import InvalidParameter, UnknownModel
-from service.errors import Overloaded, UnknownJob
-from service.job_files import JobFiles
 from service.job_ports import JobStatus
 from service.job_presentation import job_summary
+from service.job_submission import JobDesk
 from service.model_registry import pinned_name
 from service.routes.dependencies import Services, address
 
 JOBS_PATH = "/v1/jobs"
-#: Member of a job's argument: SHA-256 of everything that was asked for.
-_FINGERPRINT = "fingerprint"
 
 IdempotencyKey = Annotated[
     str | None,
@@ -55,25 +50,9 @@ def submittable_model(services: Services, name: str | None) -> str:
 def submit(
     services: Services, kind: str, argument: Mapping[str, Any], inputs: Sequence[bytes], key: str | None
 ) -> JobStatus:
-    """Make a job, or find the one that the same key has made.
-
-    Raises:
-        InvalidParameter: the key has made a job for another request.
-        Overloaded: as many jobs wait or run as may.
-    """
-    fingerprint = _fingerprint(argument, inputs)
-    identifier = services.jobs.new_id(kind, key)
-    found = _found(services, identifier) if key is not None else None
-    if found is not None:
-        if found.argument[_FINGERPRINT] != fingerprint:
-            raise InvalidParameter("This key was sent with another request; send a new one.", part="Idempotency-Key")
-        return found
-    if services.jobs.unfinished() >= services.settings.max_jobs:
-        raise Overloaded("As many jobs wait as this service accepts; send the request again later.")
-    files = JobFiles(services.blobs, identifier)
-    for number, data in enumerate(inputs):
-        files.put_input(number, data)
-    return services.jobs.enqueue(kind, {**argument, _FINGERPRINT: fingerprint}, identifier)
+    """Make a job; errors as of `JobDesk.submit`."""
+    desk = JobDesk(services.jobs, services.blobs, services.settings.max_jobs)
+    return desk.submit(kind, argument, inputs, key)
 
 
 def accepted_job(request: Request, status: JobStatus) -> Response:
@@ -81,17 +60,3 @@ def accepted_job(request: Request, status: JobStatus) -> Response:
     place = address(request, f"{JOBS_PATH}/{status.id}")
     headers = {"Location": place, "Preference-Applied": "respond-async"}
     return JSONResponse(job_summary(status, address(request, "")).model_dump(mode="json"), 202, headers=headers)
-
-
-def _found(services: Services, identifier: str) -> JobStatus | None:
-    try:
-        return services.jobs.status(identifier)
-    except UnknownJob:
-        return None
-
-
-def _fingerprint(argument: Mapping[str, Any], inputs: Sequence[bytes]) -> str:
-    digest = hashlib.sha256(json.dumps(argument, sort_keys=True).encode())
-    for data in inputs:
-        digest.update(hashlib.sha256(data).digest())
-    return digest.hexdigest()

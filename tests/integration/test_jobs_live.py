@@ -113,6 +113,8 @@ def test_commands_do_jobs_by_themselves(environment, tmp_path):
     again = command("sample", "--count", "5", "--key", "one", "--json")[1]
     assert json.loads(again)["id"] == json.loads(told)["id"]
 
+    assert command("sample", "--count", "6", "--key", "one")[0] == 2
+
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / "a.nii").write_bytes(mask_bytes())
     status, told, _ = command("reconstruct", str(tmp_path / "masks"), "--uncertainty", "none", "--json")

@@ -160,6 +160,7 @@ class DbosJobs:
                     serializer=serializer,
                     application_name=APPLICATION,
                     retry_connection_errors=False,
+                    system_database_pool_size=3,
                 )
                 self._opened = client, Leases(self._url)
             return self._opened

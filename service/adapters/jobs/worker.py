@@ -29,7 +29,7 @@ from service.adapters.jobs.database import (
     json_serializer,
     prepare,
 )
-from service.errors import KINDS, Cancelled, Overloaded
+from service.errors import KINDS, Cancelled, Overloaded, StoreFull
 from service.job_ports import Check, JobKind, Record
 from service.observability import Log, make_log
 
@@ -37,6 +37,8 @@ from service.observability import Log, make_log
 JOBS_FOLLOWED = 16
 #: Parts of one job that are queued or done at any time, so that no job fills the database.
 WINDOW = 64
+#: Connections of one worker to PostgreSQL, at most.
+CONNECTIONS = 6
 #: How often (s) queues are read, answers of parts are asked for, and a running part asks whether its job is wanted.
 POLL_S, ANSWER_POLL_S, CHECK_S = 0.1, 0.2, 0.3
 #: After so many workers have died over one part it is given up.
@@ -79,6 +81,7 @@ def running_worker(kinds: Sequence[JobKind], options: WorkerOptions, log: Log | 
         "serializer": serializer,
         "log_level": "CRITICAL",
         "run_migrations": False,
+        "sys_db_pool_size": CONNECTIONS,
     }
     dbos, busy = DBOS(config=config), _Busy()
     _register({kind.name: kind for kind in kinds}, jobs, busy, log or make_log("error"))
@@ -138,7 +141,7 @@ def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: _Busy, log: Lo
             "name": name,
             "retries_allowed": True,
             "max_attempts": ATTEMPTS,
-            "should_retry": lambda error: isinstance(error, OSError),
+            "should_retry": lambda error: isinstance(error, OSError | StoreFull),
         }
         with busy.one(), _told(log, job):
             return dict(DBOS.run_step(options, kinds[kind].parts[name], item, check))
