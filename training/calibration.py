@@ -27,6 +27,7 @@ from model.inference.posterior import (
     open_variance,
 )
 from model.inference.reconstruction import OBSERVATION_BUDGET
+from model.inference.thick_slices import through_thickness
 from training.cohorts.cohort import Case, Cohort
 from training.config import Regime
 from training.sparsify import for_evaluation
@@ -118,7 +119,9 @@ def scores(model: ShapeModel, case: Case, regime: Regime) -> Iterator[tuple[Cand
     """Cross-entropy (nats a voxel) of the posterior mean occupancy near the true surface, for each candidate."""
     drawing = for_evaluation(case.mask, case.grid, regime)
     observations = observe([drawing.stack], drawing.planes, budget=OBSERVATION_BUDGET, seed=0)
-    found = fit(model, observations, FitOptions(robust=False))
+    options = FitOptions(robust=False)
+    fitted = fit(model, observations, options)
+    found, observations = through_thickness(model, fitted, [drawing.stack], observations, options)
     index = np.argwhere(near_surface(case.mask, case.grid.spacing))
     index = index[:: -(-len(index) // SCORED_VOXELS)]
     points, truth = case.grid.to_world(index.astype(float)), case.mask[tuple(index.T)]

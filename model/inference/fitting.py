@@ -30,6 +30,7 @@ __all__ = [
     "fit_from",
     "fit_together",
     "pose_offset",
+    "refit",
     "starting_poses",
 ]
 
@@ -74,6 +75,14 @@ def _from_place(model: ShapeModel, observations: Observations, found: Fit, start
     """Go on from another fit, with the pose's prior around a start."""
     objective = Objective(model, observations, replace(start, mirrored=found.pose.mirrored), options)
     return _fit(descend([objective], [Place(found.latent, found.pose)], 1.0, options)[0], found.iterations)
+
+
+def refit(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Fit:
+    """Go on from a fit after its observations were moved; planes that it left out stay out."""
+    if found.plane_weights is not None:
+        observations = reweighted(observations, found.plane_weights)
+    anew = _from_place(model, observations, found, starting_poses(observations, options)[0], options)
+    return replace(anew, plane_weights=found.plane_weights)
 
 
 def starting_poses(observations: Observations, options: FitOptions) -> Sequence[Pose]:

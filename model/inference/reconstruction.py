@@ -21,6 +21,7 @@ from model.inference.objective import reweighted
 from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
 from model.inference.posterior import fitted_logits, laplace_covariance
 from model.inference.surface import surface_of
+from model.inference.thick_slices import through_thickness
 from model.inference.uncertainty import Estimate, ShapeState, area_estimate, surface_spread, volume_estimate
 
 UncertaintyRule = Literal["laplace", "ensemble", "none"]
@@ -116,9 +117,9 @@ def reconstruct(
     observations = observe(stacks, planes, budget=OBSERVATION_BUDGET, seed=options.seed)
     watch("fit")
     prior = discrepancy_prior(model.manifest, options.fidelity)
-    found = with_discrepancy(
-        model, fit(model, observations, FitOptions(mirror=options.mirror)), stacks, observations, prior
-    )
+    choices = FitOptions(mirror=options.mirror)
+    found, observations = through_thickness(model, fit(model, observations, choices), stacks, observations, choices)
+    found = with_discrepancy(model, found, stacks, observations, prior)
     watch("surface")
     mesh = surface_of(model, found.latent, found.pose, options.resolution_mm, found.discrepancy)
     if mesh.is_empty:

@@ -1,0 +1,85 @@
+"""Slices that stand for the majority of their thickness."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from model.geometry import Grid
+from model.inference.fitting import FitOptions, fit
+from model.inference.observations import MaskStack, find_planes, observe
+from model.inference.thick_slices import at_medians, columns_of, through_thickness
+from tests.analytic_model import ellipsoid_model
+from tests.analytic_shapes import Ellipsoid
+from tests.drawn_shapes import PARALLEL, cube_around, drawn
+
+CENTRE = np.array([30.0, -20.0, 50.0])
+MODEL = ellipsoid_model()
+TRUTH = Ellipsoid((13.0, 9.5, 6.5), CENTRE)
+THICKNESS = 5
+OPTIONS = FitOptions(robust=False, tolerance=1e-4)
+
+
+def thick_stack(offset=0):
+    """Blocks of five slices of 1 mm, averaged and cut at one half."""
+    fine = cube_around(CENTRE, nodes=45)
+    blocks = TRUTH.mask(fine)[:, :, offset:].reshape(45, 45, -1, THICKNESS).mean(axis=3) >= 0.5
+    affine = fine.affine.copy()
+    affine[:3, 2] *= THICKNESS
+    affine[:3, 3] += fine.affine[:3, 2] * (THICKNESS - 1) / 2
+    return MaskStack("mask[0]", Grid((45, 45, 9), affine), blocks, np.zeros(blocks.shape, bool))
+
+
+def observed(stack):
+    return observe([stack], find_planes([stack], "nonempty"), budget=2500, seed=0)
+
+
+def semi_axes(found):
+    return MODEL.decoder.axes(found.latent[None])[0] * np.exp(-found.pose.log_scale)
+
+
+def test_columns_are_the_thickness_of_thick_slices_alone():
+    stack = thick_stack()
+    np.testing.assert_allclose(
+        columns_of([stack], observed(stack)), np.tile([0.0, 0.0, 5.0], (2500, 1))[: len(observed(stack).points)]
+    )
+    thin = drawn(TRUTH, cube_around(CENTRE), PARALLEL)
+    assert not columns_of([thin], observe([thin], find_planes([thin], PARALLEL), budget=2500, seed=0)).any()
+
+
+def test_thin_slices_are_left_as_they_are():
+    stack = drawn(TRUTH, cube_around(CENTRE), PARALLEL)
+    observations = observe([stack], find_planes([stack], PARALLEL), budget=2500, seed=0)
+    found = fit(MODEL, observations, OPTIONS)
+    assert through_thickness(MODEL, found, [stack], observations, OPTIONS) == (found, observations)
+
+
+def test_an_observation_stands_where_the_field_takes_its_median():
+    stack = thick_stack()
+    observations = observed(stack)
+    found = fit(MODEL, observations, OPTIONS)
+    columns = columns_of([stack], observations)
+    moved = at_medians(MODEL, found, observations, columns)
+    shares = (moved.points - observations.points)[:, 2] / THICKNESS
+    assert set(np.round(shares, 6)) <= {-0.4, -0.2, 0.0, 0.2, 0.4}
+    apex = np.abs(stack.grid.to_index(observations.points)[:, 2] - 4) < 0.1
+    assert (np.abs(shares[~apex]) < 0.05).mean() > 0.8, "the field falls evenly through slices off the middle"
+    assert (np.abs(shares[apex]) > 0.1).any(), "and has its peak within the middle one"
+
+
+def test_the_majority_tells_the_shape_better_than_the_centre():
+    stack = thick_stack()
+    observations = observed(stack)
+    centred = fit(MODEL, observations, OPTIONS)
+    settled, _ = through_thickness(MODEL, centred, [stack], observations, OPTIONS)
+    errors = [np.abs(semi_axes(found) - TRUTH.semi_axes).sum() for found in (centred, settled)]
+    assert errors[1] <= errors[0] + 0.05
+
+
+def test_planes_that_were_left_out_stay_out():
+    stack = thick_stack()
+    observations = observed(stack)
+    trust = np.ones(len(observations.planes))
+    trust[0] = 0.0
+    found = replace(fit(MODEL, observations, OPTIONS), plane_weights=trust)
+    settled, _ = through_thickness(MODEL, found, [stack], observations, OPTIONS)
+    np.testing.assert_array_equal(settled.plane_weights, trust)
