@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 #: Extras that a package may import from, beside the core.
-EXTRAS = {"model": ("torch", "training"), "service": ("torch", "pacs", "demo"), "training": ("training",)}
+EXTRAS = {"model": ("torch", "training"), "service": ("torch", "pacs", "demo", "cluster"), "training": ("training",)}
 
 
 @pytest.fixture(scope="module")
