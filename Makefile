@@ -8,7 +8,7 @@ LOCKS := pyproject.toml constraints.txt
 EXAMPLE := docs/examples/hippocampus_three_slices.nii.gz
 
 .DEFAULT_GOAL := help
-.PHONY: help setup serve test lint format demo bench lock wheel clean
+.PHONY: help setup serve test lint format demo pacs bench lock wheel clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -47,6 +47,9 @@ test: lint  ## everything a change has to pass
 
 demo: $(VENV)/.demo  ## request, mesh, uncertainty map and a picture in one go, into build/demo
 	$(BIN)/python docs/examples/demo.py build/demo
+
+pacs: $(VENV)/.development  ## three drawn planes through Orthanc and back (Debian: orthanc-dicomweb dcmtk)
+	$(BIN)/python -m benchmarks.pacs scene
 
 bench: $(VENV)/.development  ## time and accuracy on this machine
 	$(BIN)/python -m benchmarks $(ARGS)

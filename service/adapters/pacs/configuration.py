@@ -25,44 +25,44 @@ class _Closed(BaseModel):
 class Tls(_Closed):
     """Certificates in PEM; both sides show one."""
 
-    certificate: Path
-    key: Path
-    authorities: Path
+    certificate: Path = Field(description="own certificate (PEM)")
+    key: Path = Field(description="its private key (PEM)")
+    authorities: Path = Field(description="certificates that vouch for the peer's (PEM)")
 
 
 class Listener(_Closed):
     """Where DIMSE associations are accepted, and from whom."""
 
-    ae_title: AeTitle = "MORPHOFLOW"
-    host: str = "127.0.0.1"
-    port: Port = 11112
+    ae_title: AeTitle = Field("MORPHOFLOW", description="title that callers must call")
+    host: str = Field("127.0.0.1", description="address to listen on")
+    port: Port = Field(11112, description="port to listen on")
     calling_ae_titles: tuple[AeTitle, ...] = Field(min_length=1, description="who may associate")
-    tls: Tls | None = None
+    tls: Tls | None = Field(None, description="associations over TLS; both sides show a certificate")
 
 
 class MoveDestination(_Closed):
     """Where images arrive that are fetched by C-MOVE; the archive must know this title and address."""
 
-    ae_title: AeTitle
-    host: str = "127.0.0.1"
-    port: Port
+    ae_title: AeTitle = Field(description="title that the archive knows")
+    host: str = Field("127.0.0.1", description="address to listen on")
+    port: Port = Field(description="port to listen on")
 
 
 class Archive(_Closed):
     """A picture archive, reached by DICOMweb or by DIMSE."""
 
-    name: str = Field(min_length=1)
+    name: str = Field(min_length=1, description="how rules call it")
     dicomweb: str | None = Field(None, description="base address of its DICOMweb services")
     authorization_file: Path | None = Field(None, description="file with the value of the header Authorization")
     authorities: Path | None = Field(None, description="certificates that vouch for the archive's (PEM)")
-    ae_title: AeTitle | None = None
-    host: str = "127.0.0.1"
-    port: Port = 104
+    ae_title: AeTitle | None = Field(None, description="its title, when it is reached by DIMSE")
+    host: str = Field("127.0.0.1", description="its address (DIMSE)")
+    port: Port = Field(104, description="its port (DIMSE)")
     local_ae_title: AeTitle = Field("MORPHOFLOW", description="title that the service calls with")
-    tls: Tls | None = None
+    tls: Tls | None = Field(None, description="TLS with an own certificate (DIMSE and DICOMweb)")
     move: MoveDestination | None = Field(None, description="fetch by C-MOVE to here; by C-GET when left out")
     commitment: bool = Field(False, description="ask for storage commitment (DIMSE)")
-    timeout_s: float = Field(30.0, gt=0)
+    timeout_s: float = Field(30.0, gt=0, description="longest wait for an answer (s)")
 
     @model_validator(mode="after")
     def _has_one_way(self) -> "Archive":
@@ -74,17 +74,17 @@ class Archive(_Closed):
 class Rule(_Closed):
     """Which drawings go to which model, and where its results go. All conditions that are given must hold."""
 
-    name: str = Field(min_length=1)
-    model: str
+    name: str = Field(min_length=1, description="how logs and jobs call it")
+    model: str = Field(description="model that reconstructs")
     senders: tuple[str, ...] = Field((), description=f"calling AE titles, or {STOW_SENDER}; anybody when empty")
     segment_codes: tuple[str, ...] = Field((), description="SCHEME:VALUE of the property type; any when empty")
     segment_labels: tuple[str, ...] = Field((), description="labels or ROI names, * and ? allowed; any when empty")
     body_parts: tuple[str, ...] = Field((), description="Body Part Examined; any when empty")
-    fetch_from: str
-    send_to: tuple[str, ...] = Field(min_length=1)
-    uncertainty: Literal["laplace", "ensemble"] = "laplace"
-    mirror: Literal["auto", "never", "always"] = "never"
-    seed: int = Field(0, ge=0)
+    fetch_from: str = Field(description="archive that has the images")
+    send_to: tuple[str, ...] = Field(min_length=1, description="archives that get the results")
+    uncertainty: Literal["laplace", "ensemble"] = Field("laplace", description="how uncertainty is found")
+    mirror: Literal["auto", "never", "always"] = Field("never", description="whether left and right are exchanged")
+    seed: int = Field(0, ge=0, description="makes results repeatable")
 
 
 class PacsConfiguration(_Closed):

@@ -16,6 +16,7 @@ from service.adapters.dicom.objects import read_object, tolerant
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome
 from service.adapters.pacs.configuration import Rule
 from service.adapters.pacs.routing import Match, find_rule
+from service.errors import UnknownJob
 from service.job_ports import BlobStore, JobEngine
 from service.pacs_ports import DRAWING_JOB, Disposition, Receipt
 
@@ -69,13 +70,21 @@ class Inbox:
         return len({key.split("/")[2] for key in self.blobs.list(f"{QUARANTINE}/")})
 
     def _accept(self, data: bytes, digest: str, match: Match) -> None:
+        """On disk first, then the job; what is in a job already, running or done, is left to it."""
         identifier = self.jobs.new_id(DRAWING_JOB, digest)
+        if self._is_in_a_job(identifier):
+            return
         labels = None if match.labels is None else sorted(match.labels)
         argument = {"object": identifier, "rule": match.rule.name, "labels": labels}
         self.blobs.put(f"{INBOX}/{identifier}/{OBJECT}", data)
-        status = self.jobs.enqueue(DRAWING_JOB, argument, identifier)
-        if status.state.is_final:  # sent once more after its results were given back
-            self.blobs.delete(f"{INBOX}/{identifier}/")
+        self.jobs.enqueue(DRAWING_JOB, argument, identifier)
+
+    def _is_in_a_job(self, identifier: str) -> bool:
+        try:
+            self.jobs.status(identifier)
+        except UnknownJob:
+            return False
+        return True
 
     def _quarantine(self, data: bytes, digest: str, sender: str, error: InputError) -> Receipt:
         quarantine(self.blobs, digest, data, str(error))
