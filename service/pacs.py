@@ -34,6 +34,7 @@ class Pacs:
 
     def __enter__(self) -> "Pacs":
         inbox = self.inbox
+        inbox.take_up()
         inbox.audit.write(AuditEntry(AuditEvent.STARTED, inbox.title, inbox.title))
         self._scope.callback(inbox.audit.write, AuditEntry(AuditEvent.STOPPED, inbox.title, inbox.title))
         if self._listener is not None:

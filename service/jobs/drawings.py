@@ -21,7 +21,7 @@ from service.adapters.dicom.series import series_of
 from service.adapters.image_guard import ImageLimits
 from service.adapters.pacs.configuration import Rule
 from service.adapters.pacs.delivery import Desk
-from service.errors import ArchiveRefused, ArchiveUnavailable
+from service.errors import ArchiveRefused, ArchiveUnavailable, Cancelled
 from service.job_ports import Check, JobKind, JobRun, Record
 from service.observability import Log
 from service.pacs_ports import DRAWING_JOB
@@ -50,9 +50,7 @@ def drawing_kind(tools: DrawingTools) -> JobKind:
     """The kind of job behind C-STORE and STOW-RS."""
 
     def follow(run: JobRun, argument: Record) -> Record:
-        rule = argument["rule"]
-        targets = tools.desk.configuration.rule(rule).send_to
-        for part in ("fetch", "reconstruct", *map(_delivery, targets)):
+        for part in ("fetch", "reconstruct", *map(_delivery, argument["send_to"])):
             answer = _until_done(tools, run, part, argument)
             if answer["state"] != DONE:
                 run.spread("quarantine", [{**argument, "reason": answer["reason"]}])
@@ -97,12 +95,19 @@ def _sleep(seconds: float) -> Record:
 def _guarded(tools: DrawingTools, item: Record, check: Check, work: Work) -> Record:
     try:
         return work(tools, item, check)
+    except FileNotFoundError:
+        return {"state": REFUSED, "reason": "The files of the drawing are gone."}
     except (ArchiveUnavailable, OSError) as error:
         reason = str(error) if isinstance(error, ArchiveUnavailable) else "A file or a connection failed."
         tools.log.warning("archive awaited", job=item["object"], reason=reason)
         return {"state": AGAIN, "reason": reason}
     except (InputError, NotFound, ArchiveRefused) as error:
         return {"state": REFUSED, "reason": str(error)}
+    except Cancelled:
+        raise
+    except Exception as fault:  # noqa: BLE001 - an object that the program stumbles over must not be lost among faults
+        tools.log.error("drawing met a fault", job=item["object"], fault=type(fault).__name__)
+        return {"state": REFUSED, "reason": "The drawing met a fault of the program."}
 
 
 def _fetch(tools: DrawingTools, item: Record, check: Check) -> Record:

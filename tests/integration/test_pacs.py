@@ -1,5 +1,6 @@
 """Drawings and results between a real archive (Orthanc) and the job, by every way that the service speaks."""
 
+import gc
 import io
 import json
 import os
@@ -31,7 +32,7 @@ from service.adapters.pacs.configuration import Archive, Listener, MoveDestinati
 from service.adapters.pacs.delivery import Desk
 from service.adapters.pacs.dimse_client import DimseArchive
 from service.adapters.pacs.dimse_server import dimse_listener
-from service.adapters.pacs.inbox import INBOX, QUARANTINE, Inbox
+from service.adapters.pacs.inbox import INBOX, OBJECT, QUARANTINE, Inbox
 from service.jobs.drawings import DrawingTools, drawing_kind
 from service.model_registry import ModelRegistry
 from service.observability import make_log
@@ -247,11 +248,11 @@ asyncio.run(main())
 """
 
 
-def test_images_may_come_after_the_drawing_but_not_for_ever(orthanc, tmp_path):
-    images, drawing = mr_series(), None
+@pytest.mark.parametrize("way", WAYS)
+def test_images_may_come_after_the_drawing_but_not_for_ever(way, orthanc, tmp_path):
     drawn, _ = sparse_ellipsoid()
-    drawing = seg_of(images, drawn)
-    service = service_with(tmp_path, by_dicomweb(orthanc))
+    drawing = seg_of(mr_series(), drawn)
+    service = service_with(tmp_path, WAYS[way](orthanc))
     service.configuration = service.configuration.model_copy(update={"images_awaited_s": 0.3})
     service.inbox.receive(file_bytes(drawing), "VIEWER")
     with service.working():
@@ -365,6 +366,20 @@ def test_what_was_acknowledged_is_there_after_a_kill(orthanc, tmp_path, reposito
     assert len(results_in(orthanc, images[0].StudyInstanceUID)) == len(RESULTS)
 
 
+def test_what_was_written_down_before_a_kill_is_taken_up(orthanc, tmp_path):
+    images, drawing = new_study(orthanc, tmp_path)
+    service = service_with(tmp_path, by_dicomweb(orthanc))
+    service.inbox.receive(file_bytes(drawing), "VIEWER")
+    service.jobs.close()
+    for file in tmp_path.glob("jobs.sqlite*"):
+        file.unlink()  # as if the kill had come before the job was made
+    again = service_with(tmp_path, by_dicomweb(orthanc))
+    again.inbox.take_up()
+    with again.working():
+        again.until_empty()
+    assert len(results_in(orthanc, images[0].StudyInstanceUID)) == len(RESULTS)
+
+
 @contextmanager
 def listening(service: Service, listener: Listener) -> Iterator[None]:
     with dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log):
@@ -399,7 +414,7 @@ def test_storescu_is_acknowledged_when_the_object_is_on_disk(orthanc, tmp_path):
     path.write_bytes(file_bytes(drawing))
     with listening(service, Listener(port=port, calling_ae_titles=("VIEWER",))):
         send([path], port, "MORPHOFLOW", "VIEWER")
-    (key,) = service.blobs.list(f"{INBOX}/")
+    (key,) = [key for key in service.blobs.list(f"{INBOX}/") if key.endswith(OBJECT)]
     kept = dcmread(io.BytesIO(service.blobs.get(key)))
     assert kept.SOPInstanceUID == drawing.SOPInstanceUID
     assert kept.PixelData == drawing.PixelData
@@ -427,6 +442,7 @@ def certificates(tmp_path) -> Tls:
     return tls
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the library's refused socket
 def test_associations_over_tls_need_a_certificate(orthanc, tmp_path, certificates):
     service = service_with(tmp_path, by_dicomweb(orthanc))
     (port,) = free_ports(1)
@@ -439,6 +455,7 @@ def test_associations_over_tls_need_a_certificate(orthanc, tmp_path, certificate
         if stranger.is_established:
             stranger.send_c_echo()
         assert not stranger.is_established
+    gc.collect()
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """An archive behind DICOMweb (PS3.18): QIDO-RS, WADO-RS, STOW-RS."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import requests
@@ -25,13 +26,7 @@ class DicomWebArchive:
 
     def images(self, study: str, series: str) -> list[Dataset]:
         """Headers of a series; none when the archive does not have it."""
-        with _faults():
-            try:
-                found = self._client.retrieve_series_metadata(study, series)
-            except requests.HTTPError as error:
-                if error.response is not None and error.response.status_code == 404:
-                    return []
-                raise
+        found = _or_nothing(partial(self._client.retrieve_series_metadata, study, series))
         with quiet():
             return [Dataset.from_json(_without_bulk(item)) for item in found]
 
@@ -54,8 +49,7 @@ class DicomWebArchive:
         self._session.close()
 
     def _instances(self, study: str, series: str) -> set[str]:
-        with _faults():
-            found = self._client.search_for_instances(study, series)
+        found = _or_nothing(partial(self._client.search_for_instances, study, series))
         return {str(item["00080018"]["Value"][0]) for item in found}
 
 
@@ -91,6 +85,17 @@ class _faults:  # noqa: N801 - reads as a statement
             raise ArchiveUnavailable("The archive cannot answer now.") from None
         if isinstance(error, requests.RequestException | OSError):
             raise ArchiveUnavailable("The archive cannot be reached.") from None
+
+
+def _or_nothing(ask: Callable[[], list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """The answer; empty where the archive says that there is nothing (404)."""
+    with _faults():
+        try:
+            return ask()
+        except requests.HTTPError as error:
+            if error.response is not None and error.response.status_code == 404:
+                return []
+            raise
 
 
 def _without_bulk(item: Mapping[str, Any]) -> dict[str, Any]:

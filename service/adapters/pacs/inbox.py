@@ -22,7 +22,7 @@ from service.pacs_ports import DRAWING_JOB, Disposition, Receipt
 
 INBOX, QUARANTINE = "dicom/inbox", "dicom/quarantine"
 #: Files of one received object.
-OBJECT, IMAGES, REASON = "object.dcm", "images.json", "reason.json"
+OBJECT, ARGUMENT, IMAGES, REASON = "object.dcm", "job.json", "images.json", "reason.json"
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,13 @@ class Inbox:
         self.log.info("object received", disposition=disposition.value, rule=match.rule.name if match else None)
         return Receipt(disposition, *uids)
 
+    def take_up(self) -> None:
+        """Make jobs of what a killed service had written down and not enqueued; its sender was not told anything."""
+        for key in list(self.blobs.list(f"{INBOX}/")):
+            identifier, _, name = key.removeprefix(f"{INBOX}/").partition("/")
+            if name == ARGUMENT and not self._is_in_a_job(identifier):
+                self.jobs.enqueue(DRAWING_JOB, json.loads(self.blobs.get(key)), identifier)
+
     def backlog(self) -> int:
         """Objects that are accepted and not given back yet."""
         return len({key.split("/")[2] for key in self.blobs.list(f"{INBOX}/")})
@@ -75,8 +82,10 @@ class Inbox:
         if self._is_in_a_job(identifier):
             return
         labels = None if match.labels is None else sorted(match.labels)
-        argument = {"object": identifier, "rule": match.rule.name, "labels": labels}
+        rule = match.rule
+        argument = {"object": identifier, "rule": rule.name, "labels": labels, "send_to": list(rule.send_to)}
         self.blobs.put(f"{INBOX}/{identifier}/{OBJECT}", data)
+        self.blobs.put(f"{INBOX}/{identifier}/{ARGUMENT}", json.dumps(argument).encode())
         self.jobs.enqueue(DRAWING_JOB, argument, identifier)
 
     def _is_in_a_job(self, identifier: str) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path
 import highdicom as hd
 import numpy as np
 import pytest
+from pydicom.uid import generate_uid
 
 from model.inference.reconstruction import Options
 from model.inference.uncertainty import voxel_entropy
@@ -19,7 +20,7 @@ from service.adapters.dicom.series import series_of
 from service.adapters.images import ImageLimits
 from service.model_registry import ModelRegistry
 from tests.analytic_model import ellipsoid_model
-from tests.dicom_parts import PATIENT_ID, checker_errors, file_bytes, mr_series, reread, seg_of
+from tests.dicom_parts import PATIENT_ID, checker_errors, file_bytes, grid_of, mr_series, reread, seg_of
 from tests.service_parts import sparse_ellipsoid
 
 LIMITS = ImageLimits(max_bytes=1 << 24, max_voxels=1 << 22)
@@ -153,3 +154,17 @@ def test_dcmqi_reads_segmentation_report_and_maps(objects, tmp_path):
     for command in commands:
         run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert run.returncode == 0, run.stdout + run.stderr
+
+
+def test_multi_frame_images_are_a_series_as_well(tmp_path):
+    images = mr_series()
+    for image in images:
+        image.WindowCenter, image.WindowWidth = 40, 400
+    enhanced = hd.legacy.LegacyConvertedEnhancedMRImage(images, generate_uid(), 5, generate_uid(), 1)
+    derivation, probability = derive([reread(enhanced)])
+    assert derivation.series.grid.coincides_with(grid_of(images))
+    results = result_objects(derivation, probability)
+    if shutil.which("dciodvfy") is not None:
+        assert [error for found in results.values() for error in checker_errors(file_bytes(found), tmp_path)] == []
+    (stack,) = stacks_of_object(reread(results["segmentation"]), "mask[0]", LIMITS, home=derivation.series.grid)
+    assert (stack.foreground == (probability >= 0.5)).all()
