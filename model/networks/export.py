@@ -77,7 +77,7 @@ class DensityGraph(nn.Module):
 
 
 class BaseJacobianGraph(nn.Module):
-    """``prior_base_jacobian``: every row of the Jacobian from its own copy of the code, in one backward pass."""
+    """``prior_base_jacobian``."""
 
     def __init__(self, prior: LatentPrior) -> None:
         super().__init__()
@@ -85,16 +85,7 @@ class BaseJacobianGraph(nn.Module):
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Base coordinates and their Jacobian."""
-        size = latent.shape[1]
-        rows = torch.eye(size)
-
-        def diagonal(copies: Tensor) -> tuple[Tensor, Tensor]:
-            base, _ = self.prior.to_base(copies.reshape(-1, size))
-            base = base.reshape(-1, size, size)
-            return (base * rows).sum(), base[:, 0]
-
-        jacobian, base = torch.func.grad(diagonal, has_aux=True)(latent[:, None, :].expand(-1, size, -1).clone())
-        return base, jacobian
+        return self.prior.base_jacobian(latent)
 
 
 class ScriptedDensity(nn.Module):

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from model.networks import splines
+from model.networks.decoder import silu_slope
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,13 @@ class MaskedLinear(nn.Linear):
         super().__init__(mask.shape[1], mask.shape[0])
         self.register_buffer("mask", mask)
 
+    def masked(self) -> Float[Tensor, "out in"]:
+        """``mask * W``."""
+        return self.mask * self.weight
+
     def forward(self, value: Float[Tensor, "*b in"]) -> Float[Tensor, "*b out"]:
         """``(mask * W) x + b``."""
-        return functional.linear(value, self.mask * self.weight, self.bias)
+        return functional.linear(value, self.masked(), self.bias)
 
 
 class SplineTransform(nn.Module):
@@ -67,14 +72,39 @@ class SplineTransform(nn.Module):
 
     def knots(self, x: Float[Tensor, "b d"]) -> splines.Knots:
         """Knots of every dimension's spline, each from the dimensions before it."""
-        value = functional.silu(self.second(functional.silu(self.first(x))))
-        raw = self.last(value).unflatten(-1, (self.shape.latent_size, splines.parameter_count(self.shape.bins)))
+        return self._constrained(self._layers(x)[-1])
+
+    def _layers(self, x: Float[Tensor, "b d"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Both hidden layers before their activations, and the splines' raw parameters (b, d, p)."""
+        first = self.first(x)
+        second = self.second(functional.silu(first))
+        raw = self.last(functional.silu(second))
+        return first, second, raw.unflatten(-1, (self.shape.latent_size, splines.parameter_count(self.shape.bins)))
+
+    def _constrained(self, raw: Float[Tensor, "b d p"]) -> splines.Knots:
         return splines.knots_of(raw, self.shape.bins, self.shape.bound)
 
     def forward(self, x: Float[Tensor, "b d"]) -> tuple[Float[Tensor, "b d"], Float[Tensor, "b"]]:
         """``y`` and ``log |det dy/dx|``."""
         y, log_slope = splines.forward(x, self.knots(x), self.shape.bound)
         return y, log_slope.sum(dim=-1)
+
+    def jacobian(self, x: Float[Tensor, "b d"]) -> tuple[Float[Tensor, "b d"], Float[Tensor, "b d d"]]:
+        """``y`` and ``dy/dx``: a spline depends on its own coordinate and its own parameters, these on the conditioner.
+
+        One backward pass through the splines serves all rows, the conditioner's derivative is a product of matrices.
+        """
+        first, second, raw = self._layers(x)
+
+        def total(value: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+            y, _ = splines.forward(value, self._constrained(parameters), self.shape.bound)
+            return y.sum(), y
+
+        (own, by_raw), y = torch.func.grad(total, argnums=(0, 1), has_aux=True)(x, raw)
+        rows = (by_raw[:, :, None] @ self.last.masked().unflatten(0, raw.shape[1:])).squeeze(2)
+        rows = (rows * silu_slope(second)[:, None]) @ self.second.masked()
+        rows = (rows * silu_slope(first)[:, None]) @ self.first.masked()
+        return y, rows + torch.diag_embed(own)
 
     def inverse_step(self, y: Float[Tensor, "b d"], guess: Float[Tensor, "b d"]) -> Float[Tensor, "b d"]:
         """One fixed-point step towards ``x``; after k steps the first k dimensions (in order) are exact."""
@@ -107,6 +137,14 @@ class SplineFlow(nn.Module):
             x, log_det = transform(x)
             total = total + log_det
         return x, total
+
+    def jacobian(self, x: Float[Tensor, "b d"]) -> tuple[Float[Tensor, "b d"], Float[Tensor, "b d d"]]:
+        """``g(x)`` and ``dg/dx``."""
+        product = torch.diag_embed(torch.ones_like(x))
+        for transform in self.transforms:
+            x, factor = transform.jacobian(x)
+            product = factor @ product
+        return x, product
 
     def inverse(self, y: Float[Tensor, "b d"]) -> Float[Tensor, "b d"]:
         """``g^-1(y)``."""

@@ -60,6 +60,14 @@ class LatentPrior(nn.Module):
         base, log_det = self.flow(latent / scale)
         return base * scale, log_det
 
+    def base_jacobian(self, latent: Float[Tensor, "b d"]) -> tuple[Float[Tensor, "b d"], Float[Tensor, "b d d"]]:
+        """``z0`` and ``dz0/dz``."""
+        if not self.shape.use_flow:
+            return latent.clone(), torch.diag_embed(torch.ones_like(latent))
+        scale = self.flow_scale()
+        base, jacobian = self.flow.jacobian(latent / scale)
+        return base * scale, scale[:, None] * jacobian / scale
+
     def from_base(self, base: Float[Tensor, "b d"]) -> Float[Tensor, "b d"]:
         """``z = g^-1(z0)``."""
         if not self.shape.use_flow:

@@ -91,3 +91,12 @@ def test_shapes_of_a_batch_do_not_touch_each_other():
     for row in range(len(x)):
         alone = flow(x[row : row + 1])
         torch.testing.assert_close(alone, (y[row : row + 1], log_det[row : row + 1]))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_jacobian_is_that_of_automatic_differentiation(size):
+    flow, x = flow_of(size), codes(size)
+    with torch.no_grad():
+        y, found = flow.jacobian(x)
+    torch.testing.assert_close(y, flow(x)[0])
+    torch.testing.assert_close(found, jacobian(lambda v: flow(v)[0], x))
