@@ -3,7 +3,9 @@
 python -m benchmarks.load.jobs --count 400
 """
 
+import json
 import time
+from datetime import datetime
 from typing import Annotated
 
 import httpx
@@ -24,6 +26,10 @@ def main(
     alone_s, beside_s = background(duration_s)
     print(f"median alone    {alone_s:8.3f} s")
     print(f"beside a job    {beside_s:8.3f} s; ratio {beside_s / alone_s:.2f} (to reach: below 1.25)")
+    told_s, last_s = cancelling()
+    print(
+        f"cancelling      {told_s:8.3f} s until the state says so; last item begun after {max(last_s, 0.0):.2f} s (1 s)"
+    )
 
 
 def job_rate(workers: int, count: int) -> float:
@@ -50,6 +56,22 @@ def background(duration_s: float) -> tuple[float, float]:
         beside = send(server, users=1, duration_s=duration_s)
         server.client.delete(place)
         return alone.quantile_s(0.5), beside.quantile_s(0.5)
+
+
+def cancelling() -> tuple[float, float]:
+    """Seconds from the request to cancel until its answer, and until the last item was begun."""
+    with serving((), {"MORPHOFLOW_JOB_WORKERS": "1", "MORPHOFLOW_LOG_LEVEL": "debug"}) as server:
+        place = begin_job(server.client, 5000)
+        while not server.client.get(place).json()["done"]:
+            time.sleep(0.1)
+        asked = time.time()
+        state = server.client.delete(place).raise_for_status().json()["state"]
+        told_s = time.time() - asked
+        time.sleep(5.0)
+        entries = [json.loads(line) for line in server.log.read_text().splitlines() if '"item begun"' in line]
+    if state != "cancelled":
+        raise SystemExit(f"The job was not cancelled: it is {state}.")
+    return told_s, max(datetime.fromisoformat(entry["timestamp"]).timestamp() for entry in entries) - asked
 
 
 def begin_job(client: httpx.Client, count: int) -> str:
