@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from typing import BinaryIO
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Bool, Shaped
 from pydicom import Dataset, dcmread
 from pydicom.errors import BytesLengthException, InvalidDicomError
 from pydicom.pixels.utils import iter_pixels
@@ -118,4 +118,14 @@ def checked_frames(found: Dataset, part: str, limits: ImageLimits) -> tuple[int,
 def frames_of(found: Dataset, part: str) -> Iterator[Shaped[np.ndarray, "rows columns"]]:
     """Stored values of each frame in turn; call `checked_frames` before."""
     with tolerant(part):
-        yield from iter_pixels(found, raw=True)
+        packed = int(found.BitsAllocated) == 1 and not found.file_meta.TransferSyntaxUID.is_compressed
+        yield from _bits_of(found) if packed else iter_pixels(found, raw=True)
+
+
+def _bits_of(found: Dataset) -> Iterator[Bool[np.ndarray, "rows columns"]]:
+    """Frames of one bit a pixel; they follow each other without a gap, so one may begin within a byte (PS3.5, 8.1)."""
+    size, data = found.Rows * found.Columns, found.PixelData
+    for start in range(0, size * int(found.get("NumberOfFrames") or 1), size):
+        held = np.frombuffer(data, np.uint8, (start + size + 7) // 8 - start // 8, start // 8)
+        bits = np.unpackbits(held, bitorder="little")[start % 8 : start % 8 + size]
+        yield bits.reshape(found.Rows, found.Columns).astype(bool)

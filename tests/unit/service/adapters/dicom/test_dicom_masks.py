@@ -19,6 +19,7 @@ LIMITS = ImageLimits(max_bytes=1 << 24, max_voxels=1 << 22)
 TURNED = ((0.8, 0.6, 0.0), (0.0, 0.0, -1.0))
 SERIES = {
     "axial": {},
+    "frames that end within a byte": {"size": (35, 31, 24)},
     "anisotropic": {"spacing": (0.7, 0.9, 3.0), "size": (40, 33, 9)},
     "oblique": {"directions": TURNED, "spacing": (0.8, 1.1, 1.5)},
 }
