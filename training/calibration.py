@@ -2,8 +2,9 @@
 
 Neighbouring voxels are not independent, so the sum of their log likelihoods overstates what a slice tells
 (likelihood precision), and what the code leaves unexplained at a contour is partly the shape's, partly the annotator's
-(spread and fidelity of the discrepancy). Each candidate is judged by the cross-entropy of the posterior mean occupancy
-on voxels near the true surface: a proper score, lowest where the fit is accurate and its uncertainty honest.
+(spread and fidelity of the discrepancy). Precision and fidelity are those that leave the fewest voxels near the true
+surface on its wrong side; the spread, which moves no surface, is the one with the lowest cross-entropy of the posterior
+mean occupancy there, a proper score.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -33,7 +34,7 @@ from training.config import Regime
 from training.sparsify import for_evaluation
 
 #: Precisions that are tried (1/mm^2), fidelities, spreads (mm), and the regimes that they are tried on.
-PRECISIONS = (0.05, 0.1, 0.2, 0.4, 0.8)
+PRECISIONS = (0.1, 0.2, 0.4, 0.8)
 FIDELITIES = (0.15, 0.3, 0.5, 0.7, 0.85)
 SPREADS_MM = (0.2, 0.35, 0.6, 1.0, 1.7)
 REGIMES: tuple[Regime, ...] = ("orthogonal", "thin", "thick")
@@ -41,7 +42,7 @@ REGIMES: tuple[Regime, ...] = ("orthogonal", "thin", "thick")
 BAND_MM = 5.0
 SCORED_VOXELS = 4000
 #: Evenly spaced validation cases that are used.
-CASES = 12
+CASES = 8
 
 Watch = Callable[[float], None]
 
@@ -54,26 +55,38 @@ class Candidate(NamedTuple):
     spread_mm: float
 
 
+class Score(NamedTuple):
+    """Means over voxels near the surface: share on its wrong side, and cross-entropy (nats)."""
+
+    error: float
+    cross_entropy: float
+
+
 @dataclass(frozen=True)
 class Calibration:
-    """The best candidate and the mean cross-entropy (nats a voxel) of each."""
+    """Mean score of each candidate."""
 
-    best: Candidate
-    scores: dict[Candidate, float]
+    scores: dict[Candidate, Score]
 
-    def best_of(self, field: str) -> dict[float, float]:
-        """Lowest score for each value of one of the fields."""
-        found: dict[float, float] = {}
-        for candidate, value in self.scores.items():
-            key = getattr(candidate, field)
-            found[key] = min(value, found.get(key, np.inf))
-        return found
+    @property
+    def best(self) -> Candidate:
+        """Most accurate first, then most honest."""
+        return min(self.scores, key=lambda candidate: self.scores[candidate])
+
+    def errors(self) -> dict[str, float]:
+        """Share of voxels on the wrong side by precision and fidelity, as text."""
+        return {f"{c.precision:g}, {c.fidelity:g}": score.error for c, score in self.scores.items()}
+
+    def cross_entropies(self) -> dict[str, float]:
+        """Cross-entropy by spread at the best precision and fidelity, as text."""
+        best = self.best[:2]
+        return {f"{c.spread_mm:g}": score.cross_entropy for c, score in self.scores.items() if c[:2] == best}
 
 
 def calibrate(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda precision: None) -> Calibration:
     """Choose for a model on cases that it was not trained on."""
     chosen = cases[:: -(-len(cases) // CASES)]
-    totals: dict[Candidate, list[float]] = {}
+    totals: dict[Candidate, list[Score]] = {}
     for precision in PRECISIONS:
         trial = with_precision(model, precision)
         for case in chosen:
@@ -81,8 +94,7 @@ def calibrate(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda pr
                 for candidate, value in scores(trial, case, regime):
                     totals.setdefault(candidate, []).append(value)
         watch(precision)
-    means = {candidate: float(np.mean(values)) for candidate, values in totals.items()}
-    return Calibration(min(means, key=means.__getitem__), means)
+    return Calibration({candidate: Score(*np.mean(values, axis=0).tolist()) for candidate, values in totals.items()})
 
 
 def calibrate_bundle(folder: Path, cohort: Cohort, watch: Watch = lambda precision: None) -> Calibration:
@@ -98,9 +110,8 @@ def calibrate_bundle(folder: Path, cohort: Cohort, watch: Watch = lambda precisi
         "split": "validation",
         "cases": [case.name for case in cohort.validation[:: -(-len(cohort.validation) // CASES)]],
         "regimes": list(REGIMES),
-        "cross_entropy": {
-            field: {f"{key:g}": value for key, value in found.best_of(field).items()} for field in Candidate._fields
-        },
+        "error_by_precision_and_fidelity": found.errors(),
+        "cross_entropy_by_spread": found.cross_entropies(),
     }
     discrepancy = {"spread_mm": found.best.spread_mm, "fidelity": found.best.fidelity}
     changed = replace(
@@ -115,13 +126,13 @@ def with_precision(model: ShapeModel, precision: float) -> ShapeModel:
     return replace(model, manifest=replace(model.manifest, likelihood_precision=precision))
 
 
-def scores(model: ShapeModel, case: Case, regime: Regime) -> Iterator[tuple[Candidate, float]]:
-    """Cross-entropy (nats a voxel) of the posterior mean occupancy near the true surface, for each candidate."""
+def scores(model: ShapeModel, case: Case, regime: Regime) -> Iterator[tuple[Candidate, Score]]:
+    """Score of each candidate on one drawing."""
     drawing = for_evaluation(case.mask, case.grid, regime)
     observations = observe([drawing.stack], drawing.planes, budget=OBSERVATION_BUDGET, seed=0)
     options = FitOptions(robust=False)
     fitted = fit(model, observations, options)
-    found, observations = through_thickness(model, fitted, [drawing.stack], observations, options)
+    found, _ = through_thickness(model, fitted, [drawing.stack], observations, options)
     index = np.argwhere(near_surface(case.mask, case.grid.spacing))
     index = index[:: -(-len(index) // SCORED_VOXELS)]
     points, truth = case.grid.to_world(index.astype(float)), case.mask[tuple(index.T)]
@@ -134,15 +145,17 @@ def scores(model: ShapeModel, case: Case, regime: Regime) -> Iterator[tuple[Cand
 
 def _scores_of(
     model: ShapeModel, found: Fit, points: Float[np.ndarray, "n 3"], truth: Bool[np.ndarray, "n"]
-) -> Iterator[tuple[float, float]]:
+) -> Iterator[tuple[float, Score]]:
     """Scores by spread: it scales the discrepancy's variance and leaves its mean."""
     logits, by_parameter, _ = fitted_jacobians(model, found, points)
     of_parameters = logit_variance(by_parameter, laplace_covariance(found))
     of_discrepancy = open_variance(found, points)
+    error = float(np.mean((logits > 0) != truth))
     for spread in SPREADS_MM:
         probability = mean_probability(logits, of_parameters + spread**2 * of_discrepancy).astype(float)
         probability = np.clip(probability, 1e-6, 1.0 - 1e-6)
-        yield spread, float(-np.mean(np.where(truth, np.log(probability), np.log1p(-probability))))
+        cross_entropy = -np.mean(np.where(truth, np.log(probability), np.log1p(-probability)))
+        yield spread, Score(error, float(cross_entropy))
 
 
 def near_surface(mask: Bool[np.ndarray, "i j k"], spacing: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "i j k"]:

@@ -104,7 +104,7 @@ def calibrate(
 ) -> None:
     """Choose on validation shapes how much a drawn mm^2 is worth and how far slices are followed; record both."""
     with exit_status():
-        from training.calibration import PRECISIONS, Candidate, calibrate_bundle
+        from training.calibration import PRECISIONS, calibrate_bundle
 
         options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
         found = open_cohort(cohort, masks, data, options, labels=tuple(label or ()))
@@ -113,16 +113,16 @@ def calibrate(
         with progress(len(PRECISIONS), f"calibrating on {found.name}") as bar:
             chosen = calibrate_bundle(bundle, found, lambda precision: bar.advance(bar.task_ids[0]))
         best = chosen.best
-        scores = {field: chosen.best_of(field) for field in Candidate._fields}
         summary = {
             "likelihood_precision": best.precision,
             "fidelity": best.fidelity,
             "spread_mm": best.spread_mm,
-            "cross_entropy": scores,
+            "error_by_precision_and_fidelity": chosen.errors(),
+            "cross_entropy_by_spread": chosen.cross_entropies(),
         }
         words = (
             f"likelihood precision {best.precision:g} per mm^2, fidelity {best.fidelity:g}, "
-            f"spread {best.spread_mm:g} mm (lowest cross-entropy {chosen.scores[best]:.4f} nats a voxel)"
+            f"spread {best.spread_mm:g} mm ({chosen.scores[best].error:.4f} of the voxels near the surface on its wrong side)"
         )
         typer.echo(json.dumps(summary) if as_json else words)
 

@@ -20,6 +20,7 @@ from model.inference.mesh import Mesh
 from model.inference.objective import reweighted
 from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
 from model.inference.posterior import fitted_logits, laplace_covariance
+from model.inference.reliability import figures_of, less_trusting, reliability_warnings
 from model.inference.surface import surface_of
 from model.inference.thick_slices import through_thickness
 from model.inference.uncertainty import Estimate, ShapeState, area_estimate, surface_spread, volume_estimate
@@ -114,12 +115,13 @@ def reconstruct(
     _check(options)
     watch("observations")
     planes = find_planes(stacks, options.annotated)
-    observations = observe(stacks, planes, budget=OBSERVATION_BUDGET, seed=options.seed)
+    drawing = observe(stacks, planes, budget=OBSERVATION_BUDGET, seed=options.seed)
     watch("fit")
     prior = discrepancy_prior(model.manifest, options.fidelity)
     choices = FitOptions(mirror=options.mirror)
-    found, observations = through_thickness(model, fit(model, observations, choices), stacks, observations, choices)
-    found = with_discrepancy(model, found, stacks, observations, prior)
+    fitted = fit(model, drawing, choices)
+    settled, observations = through_thickness(model, fitted, stacks, drawing, choices)
+    found = with_discrepancy(model, settled, stacks, drawing, prior)
     watch("surface")
     mesh = surface_of(model, found.latent, found.pose, options.resolution_mm, found.discrepancy)
     if mesh.is_empty:
@@ -136,6 +138,7 @@ def reconstruct(
     trusted = observations if found.plane_weights is None else reweighted(observations, found.plane_weights)
     sections = sections_of(observations, fitted_logits(model, found, observations.points), found.plane_weights)
     density, percentile = typicality(model, found)
+    figures = figures_of(model, found, stacks, observations, mesh, usual)
     return Reconstruction(
         state=state,
         mesh=mesh,
@@ -146,7 +149,10 @@ def reconstruct(
         area_cm2=area_estimate(mesh, spread),
         log_prior_density=density,
         typicality_percentile=percentile,
-        warnings=_warnings(found, percentile) + plane_warnings(sections) + coverage_warnings(trusted, mesh.vertices),
+        warnings=_warnings(found, percentile)
+        + plane_warnings(sections, _doubted(observations, found))
+        + coverage_warnings(trusted, mesh.vertices)
+        + reliability_warnings(model.manifest.usual, figures, stacks, observations.planes, mesh),
     )
 
 
@@ -185,6 +191,10 @@ def typicality(model: ShapeModel, found: Fit) -> tuple[float, float]:
     """Log prior density of the fitted code (nats) and its percentile in the training population."""
     density = float(model.prior.log_density(found.latent[None])[0][0])
     return density, float(100.0 * np.mean(model.population.log_densities < density))
+
+
+def _doubted(observations: Observations, found: Fit) -> Plane | None:
+    return None if found.doubted is None else observations.planes[found.doubted]
 
 
 def _warnings(found: Fit, percentile: float) -> tuple[str, ...]:

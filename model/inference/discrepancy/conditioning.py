@@ -148,7 +148,7 @@ def _wrong_side(
         return _Evidence(np.zeros((0, 3)), np.zeros(0))
     apart = APART_MM * plane_of[:, None], APART_MM * observations.plane_of[wrong][:, None]
     tree = cKDTree(np.hstack([contour, apart[0]]))
-    distance, _ = tree.query(np.hstack([observations.points[wrong], apart[1]]))
+    distance = np.asarray(tree.query(np.hstack([observations.points[wrong], apart[1]]))[0])
     clear = (distance > CLEARLY_WRONG_MM) & (distance < APART_MM)
     chosen = wrong[clear]
     return _Evidence(observations.points[chosen], np.where(inside[chosen], distance[clear], -distance[clear]))
