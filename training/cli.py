@@ -122,7 +122,7 @@ def calibrate(
         }
         words = (
             f"likelihood precision {best.precision:g} per mm^2, fidelity {best.fidelity:g}, "
-            f"spread {best.spread_mm:g} mm ({chosen.scores[best].error:.4f} of the voxels near the surface on its wrong side)"
+            f"spread {best.spread_mm:g} mm ({100.0 * chosen.scores[best].error:.2f} % of voxels near the surface wrong)"
         )
         typer.echo(json.dumps(summary) if as_json else words)
 
