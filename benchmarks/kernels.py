@@ -10,13 +10,14 @@ what else runs on the machine only adds time. Both use as many threads as ``OMP_
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import onnx
+import onnx.utils
 import typer
 from jaxtyping import Float
 
@@ -28,6 +29,8 @@ from model.inference.surface import canonical_box, surface_of
 SHIPPED = Path(__file__).resolve().parents[1] / "model" / "bundles"
 MATRIX_SIZE = 1024
 FIT_POINTS = 2500
+#: Operations a point of logits alone, with Jacobians, and with the derivatives by point only.
+APoint = tuple[float, float, float]
 
 
 @dataclass
@@ -61,7 +64,7 @@ class TimedDecoder:
     """A decoder that keeps account of the time spent in it."""
 
     decoder: Decoder
-    a_point: tuple[float, float]
+    a_point: APoint
     spent: Share
     latent_size: int
 
@@ -81,6 +84,15 @@ class TimedDecoder:
         self._note(points, self.a_point[1], begin)
         return result
 
+    def logits_and_gradients(
+        self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]
+    ) -> tuple[Float[np.ndarray, "b n"], Float[np.ndarray, "b n 3"]]:
+        """See `Decoder`."""
+        begin = time.perf_counter()
+        result = self.decoder.logits_and_gradients(latent, points)
+        self._note(points, self.a_point[2], begin)
+        return result
+
     def _note(self, points: Float[np.ndarray, "b n 3"], operations: float, begin: float) -> None:
         count = points.shape[0] * points.shape[1]
         self.spent.add(count, operations * count, time.perf_counter() - begin)
@@ -93,8 +105,13 @@ def main(
     """Fraction of the machine's matrix-product rate that fit and surface reach in the network."""
     threads = int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1))
     model = open_bundle(bundle, threads=threads)
-    a_point = tuple(operations_a_point(bundle / f"decoder_{name}.onnx") for name in ("logits", "jacobians"))
-    best, rate = measure(model, (a_point[0], a_point[1]), repeats)
+    jacobians = bundle / "decoder_jacobians.onnx"
+    a_point = (
+        operations_a_point(bundle / "decoder_logits.onnx", ("logits",)),
+        operations_a_point(jacobians, ("logits", "by_latent", "by_point")),
+        operations_a_point(jacobians, ("logits", "by_point")),
+    )
+    best, rate = measure(model, a_point, repeats)
     typer.echo(f"threads {threads}, matrix product {rate:.0f} GFLOP/s (float32, {MATRIX_SIZE} x {MATRIX_SIZE})")
     typer.echo(f"{'work':<10}{'calls':>7}{'points':>9}{'GFLOP':>9}{'ms':>9}{'GFLOP/s':>10}{'fraction':>10}")
     for name, share in best.items():
@@ -104,7 +121,7 @@ def main(
         )
 
 
-def measure(model: ShapeModel, a_point: tuple[float, float], repeats: int) -> tuple[dict[str, Share], float]:
+def measure(model: ShapeModel, a_point: APoint, repeats: int) -> tuple[dict[str, Share], float]:
     """Best shares of fit and surface, and the best rate of a matrix product (GFLOP/s), measured in turn."""
     works = {"fit": _fit_call, "surface": _surface}
     best: dict[str, Share] = {}
@@ -129,9 +146,10 @@ def matrix_rate() -> float:
     return float(2.0 * MATRIX_SIZE**3 / (time.perf_counter() - begin) / 1e9)
 
 
-def operations_a_point(path: Path) -> float:
-    """Multiplications and additions of a graph's matrix products for one point."""
-    graph = onnx.shape_inference.infer_shapes(onnx.load(path)).graph
+def operations_a_point(path: Path, outputs: Sequence[str]) -> float:
+    """Multiplications and additions of the matrix products that a graph needs for some of its outputs, a point."""
+    wanted = onnx.utils.Extractor(onnx.load(path)).extract_model(["latent", "points"], list(outputs))
+    graph = onnx.shape_inference.infer_shapes(wanted).graph
     sizes = {item.name: list(item.dims) for item in graph.initializer}
     for value in (*graph.value_info, *graph.input, *graph.output):
         sizes.setdefault(value.name, [side.dim_value for side in value.type.tensor_type.shape.dim])
@@ -139,7 +157,7 @@ def operations_a_point(path: Path) -> float:
     return sum(2.0 * float(np.prod(sizes[node.input[1]])) for node in products)
 
 
-def _spent(model: ShapeModel, a_point: tuple[float, float], work: Callable[[ShapeModel], object]) -> Share:
+def _spent(model: ShapeModel, a_point: APoint, work: Callable[[ShapeModel], object]) -> Share:
     timed = TimedDecoder(model.decoder, a_point, Share(), model.manifest.latent_size)
     work(replace(model, decoder=timed))
     return timed.spent

@@ -5,6 +5,7 @@ ONNX Runtime stands behind them by default, TorchScript when asked for. Batches 
 """
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -29,6 +30,12 @@ class Decoder(Protocol):
         self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]
     ) -> tuple[Float[np.ndarray, "b n"], Float[np.ndarray, "b n d"], Float[np.ndarray, "b n 3"]]:
         """Logits with their derivatives by latent code and by point (per mm)."""
+        ...
+
+    def logits_and_gradients(
+        self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]
+    ) -> tuple[Float[np.ndarray, "b n"], Float[np.ndarray, "b n 3"]]:
+        """Logits with their derivatives by point (per mm)."""
         ...
 
 
@@ -63,8 +70,10 @@ class OnnxDecoder:
     def __init__(self, folder: Path, latent_size: int, threads: int | None) -> None:
         self.latent_size = latent_size
         self._workers = Workers(threads or os.cpu_count() or 1)
+        jacobians = _session(folder / "decoder_jacobians.onnx", 1)
         self._logits = _network(_session(folder / "decoder_logits.onnx", 1))
-        self._jacobians = _network(_session(folder / "decoder_jacobians.onnx", 1))
+        self._jacobians = _network(jacobians)
+        self._gradients = _network(jacobians, ("logits", "by_point"))
 
     def logits(self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n"]:
         """See `Decoder`."""
@@ -76,6 +85,13 @@ class OnnxDecoder:
         """See `Decoder`."""
         logits, by_latent, by_point = self._workers.evaluate(self._jacobians, latent, points)
         return logits, by_latent, by_point
+
+    def logits_and_gradients(
+        self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]
+    ) -> tuple[Float[np.ndarray, "b n"], Float[np.ndarray, "b n 3"]]:
+        """See `Decoder`."""
+        logits, by_point = self._workers.evaluate(self._gradients, latent, points)
+        return logits, by_point
 
 
 class OnnxPrior:
@@ -149,11 +165,14 @@ def _session(path: Path, threads: int | None) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
-def _network(session: onnxruntime.InferenceSession) -> Network:
-    """A decoder's graph as a function of arrays."""
+def _network(session: onnxruntime.InferenceSession, outputs: Sequence[str] | None = None) -> Network:
+    """A decoder's graph as a function of arrays; of its outputs only those named, and no arithmetic for others."""
+    options = onnxruntime.RunOptions()
+    options.only_execute_path_to_fetches = outputs is not None
 
     def network(latent: Array, points: Array) -> list[Array]:
-        return _run(session, latent=latent, points=points)
+        results: list[Array] = session.run(outputs, {"latent": latent, "points": points}, options)
+        return results
 
     return network
 

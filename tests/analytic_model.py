@@ -45,6 +45,13 @@ class EllipsoidDecoder:
         by_point = -STEEPNESS * scaled / axes / radius
         return STEEPNESS * (1.0 - radius[..., 0]), by_latent, by_point
 
+    def logits_and_gradients(
+        self, latent: Float[np.ndarray, "b 3"], points: Float[np.ndarray, "b n 3"]
+    ) -> tuple[Float[np.ndarray, "b n"], Float[np.ndarray, "b n 3"]]:
+        """The same with derivatives by point alone."""
+        logits, _, by_point = self.logits_and_jacobians(latent, points)
+        return logits, by_point
+
 
 @dataclass(frozen=True)
 class BentDecoder(EllipsoidDecoder):

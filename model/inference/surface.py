@@ -36,7 +36,7 @@ def surface_of(
         return logits if discrepancy is None else discrepancy.corrected(logits, points)
 
     def gradient(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-        logits, _, by_point = model.decoder.logits_and_jacobians(latent[None], points[None])
+        logits, by_point = model.decoder.logits_and_gradients(latent[None], points[None])
         if discrepancy is None:
             return logits[0], by_point[0]
         slopes = discrepancy.shrinkage(logits[0])[:, None] * by_point[0]

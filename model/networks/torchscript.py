@@ -29,6 +29,13 @@ class ScriptDecoder:
             logits, by_latent, by_point = self._jacobians(_tensor(latent), _tensor(points))
         return _array(logits), _array(by_latent), _array(by_point)
 
+    def logits_and_gradients(
+        self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]
+    ) -> tuple[Float[np.ndarray, "b n"], Float[np.ndarray, "b n 3"]]:
+        """See `model.backends.Decoder`."""
+        logits, _, by_point = self.logits_and_jacobians(latent, points)
+        return logits, by_point
+
 
 class ScriptPrior:
     """A bundle's prior; see `model.backends.Prior`."""

@@ -41,6 +41,8 @@ def test_the_decoder_is_the_network(backend, exported):
     expected = exported.decoder.jacobians(single(codes()), single(points()))
     for found, want in zip(decoder.logits_and_jacobians(codes(), points()), expected, strict=True):
         close(found, want.numpy())
+    for found, want in zip(decoder.logits_and_gradients(codes(), points()), expected[::2], strict=True):
+        close(found, want.numpy())
 
 
 def test_the_prior_is_the_network(backend, exported):
