@@ -7,7 +7,7 @@ import pytest
 
 from model.inference.discrepancy.covariance import Covariance
 from model.inference.discrepancy.grouping import cells_of, means_of
-from model.inference.discrepancy.process import Discrepancy
+from model.inference.discrepancy.process import NEAREST, Discrepancy
 
 RANDOM = np.random.default_rng(0)
 COVARIANCE = Covariance((0.5, 0.4), (3.0, 9.0))
@@ -105,3 +105,25 @@ def test_cells_hold_their_means_and_keep_kinds_apart():
         assert len(set(np.flatnonzero(cells == cell) % 2)) == 1
         np.testing.assert_allclose(means_of(cells, POINTS)[cell], members.mean(axis=0))
         assert np.ptp(members, axis=0).max() <= 5.0
+
+
+def on_a_cylinder(angles, heights):
+    return np.stack([10.0 * np.cos(angles), 10.0 * np.sin(angles), heights], axis=1)
+
+
+def test_variance_by_the_nearest_contours_is_nearly_that_by_all():
+    around, slices = np.meshgrid(np.linspace(0, 2 * np.pi, 42, endpoint=False), np.linspace(-20.0, 20.0, 9))
+    points = on_a_cylinder(around.ravel(), slices.ravel())
+    places = on_a_cylinder(RANDOM.uniform(0, 2 * np.pi, 300), RANDOM.uniform(-22.0, 22.0, 300))
+    assert len(points) > 3 * NEAREST
+    process = replace(PROCESS, points=points, residuals=np.zeros(len(points)), jacobian=np.zeros((len(points), 4)))
+    cross = written_out(places, points)
+    gram = written_out(points, points) + 0.2**2 * np.eye(len(points))
+    exact = COVARIANCE.variance - np.einsum("mn,nm->m", cross, np.linalg.solve(gram, cross.T))
+    np.testing.assert_allclose(np.sqrt(process.variance(places)), np.sqrt(exact), rtol=0.02)
+
+
+def test_quadratic_form_is_the_variance_of_a_sum():
+    weights = RANDOM.uniform(size=200)
+    expected = weights @ written_out(PLACES, PLACES) @ weights
+    assert COVARIANCE.quadratic_form(PLACES, weights) == pytest.approx(expected, rel=0.02)
