@@ -48,6 +48,9 @@ class DimseArchive:
         """Headers of a series; none when the archive does not have it."""
         query = Dataset()
         query.QueryRetrieveLevel, query.StudyInstanceUID, query.SeriesInstanceUID = "SERIES", study, series
+        with self._associated([sop_classes.FIND]) as peer:  # archives fail to get what they do not have
+            if not self._matches(peer, query):
+                return []
         return self._get(query) if self._archive.move is None else self._move(query)
 
     def store(self, objects: Sequence[Dataset]) -> None:
@@ -99,7 +102,12 @@ class DimseArchive:
         query.QueryRetrieveLevel = "IMAGE"
         for name in ("StudyInstanceUID", "SeriesInstanceUID", "SOPInstanceUID"):
             setattr(query, name, found[name].value)
+        return self._matches(peer, query)
+
+    def _matches(self, peer: Any, query: Dataset) -> bool:
         answers = list(peer.send_c_find(query, sop_classes.FIND))  # to the last, or the next query meets the rest
+        if not answers or answers[-1][0].get("Status") != SUCCESS:
+            raise ArchiveUnavailable("The archive did not answer a query.")
         return any(status.get("Status") in PENDING for status, _ in answers)
 
     def _is_committed(self, objects: Sequence[Dataset]) -> bool:
