@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg.lapack import spotrf, strtrs
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial import cKDTree
 
@@ -88,8 +89,8 @@ class Discrepancy:
         result = np.empty(len(canonical))
         for rows, near in self._neighbourhoods(canonical):
             points = self.points[near]
-            factor = np.linalg.cholesky(self._gram[np.ix_(near, near)])
-            seen = solve_triangular(factor, self.covariance.between(points, canonical[rows]), lower=True)
+            factor, _ = spotrf(self._gram[near[:, None], near], lower=True)
+            seen, _ = strtrs(factor, self.covariance.between(points, canonical[rows]), lower=True)
             result[rows] = self.covariance.variance - np.square(seen).sum(axis=0)
         return np.maximum(result, 0.0)
 
