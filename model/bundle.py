@@ -47,6 +47,9 @@ class Manifest:
         likelihood_precision: information of one mm^2 of annotated plane, 1/mm^2; calibrated on validation shapes.
         discrepancy: ``spread_mm`` and ``fidelity`` of what the code leaves unexplained at contours, chosen on validation
             shapes (`model.inference.discrepancy`); empty when they were not.
+        usual: highest figures that answers from sound drawings usually have (`model.inference.reliability`), estimated
+            on validation shapes: ``misfit_mm`` and ``surface_sd_mm`` with five planes, ``misfit_exponent`` and
+            ``surface_sd_exponent`` in the number of planes; not judged when empty.
         training: cohort, cases, regime, command and so on.
         licence, attribution: of the weights.
         accuracy: measured figures by regime, for example ``{"thin": {"dice": 0.87, "asd_mm": 0.34}}``.
@@ -74,6 +77,7 @@ class Manifest:
     files: dict[str, str]
     anatomy: dict[str, str] = field(default_factory=dict)
     discrepancy: dict[str, float] = field(default_factory=dict)
+    usual: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

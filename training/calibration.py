@@ -32,6 +32,7 @@ from model.inference.thick_slices import through_thickness
 from training.cohorts.cohort import Case, Cohort
 from training.config import Regime
 from training.sparsify import for_evaluation
+from training.usual import usual_figures
 
 #: Precisions that are tried (1/mm^2), fidelities, spreads (mm), and the regimes that they are tried on.
 PRECISIONS = (0.1, 0.2, 0.4, 0.8)
@@ -117,6 +118,8 @@ def calibrate_bundle(folder: Path, cohort: Cohort, watch: Watch = lambda precisi
     changed = replace(
         model.manifest, likelihood_precision=found.best.precision, discrepancy=discrepancy, calibration=facts
     )
+    judged = replace(model, manifest=changed)
+    changed = replace(changed, usual=usual_figures(judged, cohort.validation[:: -(-len(cohort.validation) // CASES)]))
     write_manifest(changed, folder)
     return found
 

@@ -76,8 +76,8 @@ def disagreeing_planes(sections: Sequence[Section]) -> list[Plane]:
     ]
 
 
-def plane_warnings(sections: Sequence[Section]) -> tuple[str, ...]:
-    """What to tell about planes that were left out, and about those that the reconstruction misses."""
+def plane_warnings(sections: Sequence[Section], doubted: Plane | None = None) -> tuple[str, ...]:
+    """What to tell about planes that were left out, those that the reconstruction misses, and one that stands out."""
     sentences = []
     left_out = [section.plane for section in sections if not section.trusted]
     if left_out:
@@ -87,6 +87,11 @@ def plane_warnings(sections: Sequence[Section]) -> tuple[str, ...]:
     apart = disagreeing_planes(sections)
     if apart:
         sentences.append(f"The reconstruction disagrees with the drawing on {_names(apart)}; do not rely on it there.")
+    if doubted is not None and doubted not in apart:
+        sentences.append(
+            f"The drawing on {_names([doubted])} agrees less with the others than they do among themselves; check it, "
+            "and do not rely on the answer if it is wrong."
+        )
     return tuple(sentences)
 
 

@@ -69,6 +69,7 @@ class Fit:
         precision: (d + 7, d + 7) curvature of the objective over (latent, pose step).
         plane_weights: (k,) trust in each annotated plane: 0 for one that contradicts the others and was left out of
             the fit, else 1; None when that was not looked into.
+        doubted: number of a plane that stands out from the others, though too little to be left out, or None.
         discrepancy: what the drawn contours show and the code cannot express; None when it was not asked for.
     """
 
@@ -80,4 +81,5 @@ class Fit:
     objective: float
     precision: Float[np.ndarray, "p p"]
     plane_weights: Float[np.ndarray, "k"] | None = None
+    doubted: int | None = None
     discrepancy: Discrepancy | None = None

@@ -31,6 +31,7 @@ __all__ = [
     "fit_together",
     "pose_offset",
     "refit",
+    "searched",
     "starting_poses",
 ]
 
@@ -54,21 +55,35 @@ def fit(model: ShapeModel, observations: Observations, options: FitOptions) -> F
     return _without_wrong_planes(model, observations, found, options) if options.robust else found
 
 
-def _without_wrong_planes(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Fit:
+def searched(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Fit:
+    """The fit less planes that contradict the others, each of which is tried: for a fit that misses the contours.
+
+    Unchanged where planes were left out before.
+    """
+    if not options.robust or (found.plane_weights is not None and not found.plane_weights.all()):
+        return found
+    return _without_wrong_planes(model, observations, found, options, every_plane=True)
+
+
+def _without_wrong_planes(
+    model: ShapeModel, observations: Observations, found: Fit, options: FitOptions, every_plane: bool = False
+) -> Fit:
     """Leave out, one by one, planes that contradict all others, and fit anew to the rest."""
     trust = np.ones(len(observations.planes))
-    trusted = observations
+    trusted, doubted = observations, None
     for _ in range(most_wrong(observations)):
-        wrong = contradicting_plane(model, trusted, found, starting_poses(trusted, options)[0], options)
-        if wrong is None:
+        start = starting_poses(trusted, options)[0]
+        verdict = contradicting_plane(model, trusted, found, start, options, every_plane)
+        if verdict is None or not verdict.blamed:
+            doubted = None if verdict is None else verdict.plane
             break
-        trust[wrong] = 0.0
+        trust[verdict.plane] = 0.0
         trusted = reweighted(observations, trust)
         poses = starting_poses(trusted, options)
         anew = _from_starts(model, trusted, poses, options)
         on = _from_place(model, trusted, found, poses[0], options)
         found = min(anew, on, key=lambda one: one.objective)
-    return replace(found, plane_weights=trust)
+    return replace(found, plane_weights=trust, doubted=doubted)
 
 
 def _from_place(model: ShapeModel, observations: Observations, found: Fit, start: Pose, options: FitOptions) -> Fit:
@@ -82,7 +97,7 @@ def refit(model: ShapeModel, observations: Observations, found: Fit, options: Fi
     if found.plane_weights is not None:
         observations = reweighted(observations, found.plane_weights)
     anew = _from_place(model, observations, found, starting_poses(observations, options)[0], options)
-    return replace(anew, plane_weights=found.plane_weights)
+    return replace(anew, plane_weights=found.plane_weights, doubted=found.doubted)
 
 
 def starting_poses(observations: Observations, options: FitOptions) -> Sequence[Pose]:

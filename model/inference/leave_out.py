@@ -8,7 +8,7 @@ objective, to second order, by
 (one Newton step of the remaining objective from the optimum of all; Cook 1977). The second term is what the plane bends
 the shape to its own will. A plane drawn as the others say gains a small multiple of the entropy ``S_k`` of labels drawn
 from the field, the same multiple on every plane of a drawing. The planes that stand out are then left out for good, one
-at a time, and the one whose absence explains most is blamed.
+at a time, and the one whose absence explains most is blamed, or doubted when it stands out less.
 """
 
 from collections.abc import Sequence
@@ -33,6 +33,10 @@ PLANES_PER_WRONG = 4
 TRIAL_RATIO = 2.5
 #: The plane blamed gains so many times, and so many nats, more than is typical.
 BLAME_RATIO, BLAME_NATS = 4.0, 20.0
+#: The plane doubted gains so many times, and so many nats, more.
+DOUBT_RATIO, DOUBT_NATS = 2.5, 15.0
+#: A thorough search is for drawings of no more planes than this.
+MOST_SEARCHED = 12
 #: What a plane's gain is held against is at least this share of the median plane's.
 SMALLEST_SHARE = 1.0
 #: What remains of the curvature without a plane is at least this share of it in each parameter.
@@ -70,6 +74,16 @@ class Verdict:
         """How many times more than typical."""
         return self.gain / max(self.typical, 1e-9)
 
+    @property
+    def blamed(self) -> bool:
+        """Whether the plane contradicts all others."""
+        return self.ratio > BLAME_RATIO and self.excess > BLAME_NATS
+
+    @property
+    def doubted(self) -> bool:
+        """Whether it stands out, though perhaps for the shape's sake."""
+        return self.ratio > DOUBT_RATIO and self.excess > DOUBT_NATS
+
 
 def most_wrong(observations: Observations) -> int:
     """How many planes may be left out at most."""
@@ -78,24 +92,42 @@ def most_wrong(observations: Observations) -> int:
 
 
 def contradicting_plane(
-    model: ShapeModel, observations: Observations, found: Fit, start: Pose, options: FitOptions
-) -> int | None:
-    """The plane whose absence explains most, if that is far beyond what is typical of the drawing; otherwise None.
+    model: ShapeModel,
+    observations: Observations,
+    found: Fit,
+    start: Pose,
+    options: FitOptions,
+    every_plane: bool = False,
+) -> Verdict | None:
+    """On the plane whose absence explains most, if that is beyond what is typical of the drawing; otherwise None.
 
     Suspects are tried on few of the observations, and those that stand out there on all.
+
+    Args:
+        every_plane: whether each plane is tried on all observations instead, unless they are many. A fit that was bent
+            far to the will of a wrong plane at the end of a drawing suspects others.
     """
     start = replace(start, mirrored=found.pose.mirrored)
+    quick = replace(options, tolerance=TRIAL_TOLERANCE, max_iterations=TRIAL_ITERATIONS)
+    tried = np.unique(observations.plane_of[observations.weights > 0])
+    if not every_plane or len(tried) > MOST_SEARCHED:
+        tried = _standing_out(model, observations, found, start, quick)
+    if not tried.size:
+        return None
+    thorough = replace(quick, max_iterations=options.max_iterations)
+    worst = max(verdicts(model, observations, found, start, thorough, tried), key=lambda one: one.excess)
+    return worst if worst.doubted else None
+
+
+def _standing_out(
+    model: ShapeModel, observations: Observations, found: Fit, start: Pose, options: FitOptions
+) -> Int[np.ndarray, "s"]:
+    """Suspects that gain much from being left out of few observations."""
     # Trials take the prior as it is around the optimum: steps are small, and its network is not asked again.
     tangent = LinearPrior.around(model.prior, found.latent).base_jacobian
     every = min(TRIAL_EVERY, len(observations.points) // TRIAL_FEWEST)
-    quick = replace(options, tolerance=TRIAL_TOLERANCE, max_iterations=TRIAL_ITERATIONS)
-    rough = verdicts(model, thinned(observations, every, seed=0), found, start, quick, base_jacobian=tangent)
-    standing_out = np.array([one.plane for one in rough if one.ratio > TRIAL_RATIO], dtype=int)
-    if not standing_out.size:
-        return None
-    thorough = replace(quick, max_iterations=options.max_iterations)
-    blamed = max(verdicts(model, observations, found, start, thorough, standing_out), key=lambda one: one.excess)
-    return blamed.plane if blamed.ratio > BLAME_RATIO and blamed.excess > BLAME_NATS else None
+    rough = verdicts(model, thinned(observations, every, seed=0), found, start, options, base_jacobian=tangent)
+    return np.array([one.plane for one in rough if one.ratio > TRIAL_RATIO], dtype=int)
 
 
 def verdicts(

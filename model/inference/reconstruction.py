@@ -121,6 +121,8 @@ def reconstruct(
     choices = FitOptions(mirror=options.mirror)
     fitted = fit(model, drawing, choices)
     settled, observations = through_thickness(model, fitted, stacks, drawing, choices)
+    usual = discrepancy_prior(model.manifest)
+    model, settled = less_trusting(model, settled, stacks, observations, choices, usual)
     found = with_discrepancy(model, settled, stacks, drawing, prior)
     watch("surface")
     mesh = surface_of(model, found.latent, found.pose, options.resolution_mm, found.discrepancy)
@@ -138,7 +140,7 @@ def reconstruct(
     trusted = observations if found.plane_weights is None else reweighted(observations, found.plane_weights)
     sections = sections_of(observations, fitted_logits(model, found, observations.points), found.plane_weights)
     density, percentile = typicality(model, found)
-    figures = figures_of(model, found, stacks, observations, mesh, usual)
+    figures = figures_of(model, found, stacks, drawing, mesh, usual)
     return Reconstruction(
         state=state,
         mesh=mesh,

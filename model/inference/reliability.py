@@ -1,0 +1,214 @@
+"""Whether an answer is as accurate as the model's usually are, judged by what can be known without the truth.
+
+Of the drawing itself: contours that the border of an image cuts off, and slices that are thick for the object. Of the
+fit: how far the contours lie from the fitted shape before it follows them (misfit: noise of the annotator, planes that
+contradict each other, a shape that the code cannot express) and how far the surface may lie elsewhere (mean posterior
+SD: few planes, badly placed ones). Both are held against what sound drawings of as many planes give (`Manifest.usual`).
+A drawing with a high misfit is trusted less: the fit goes on with a lower likelihood precision.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from model.bundle import ShapeModel
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
+from model.inference.fitting import Fit, FitOptions, refit, searched
+from model.inference.mask_stack import MaskStack, Plane, section_of
+from model.inference.mesh import Mesh, volume_ml
+from model.inference.observations import Observations
+from model.inference.posterior import (
+    fitted_jacobians,
+    laplace_covariance,
+    logit_variance,
+    normal_displacements,
+    open_variance,
+)
+from model.inference.thick_slices import THICK_RATIO
+
+#: Contours of which more than this share is open are called cut off: sound drawings of 16 validation shapes have none,
+#: those that end at three quarters of the object 0.07 to 0.22.
+OPEN_SHARE = 0.05
+#: Slices thicker than this share of the object's size (cube root of its volume) hide some of its shape.
+THICK_SHARE = 0.15
+#: Number of planes that the figures in `Manifest.usual` are for.
+USUAL_PLANES = 5
+#: Vertices at which the SD is taken, about.
+JUDGED_VERTICES = 400
+#: Share of the likelihood precision that is left to a rough drawing.
+ROUGH_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a fit says about itself.
+
+    Attributes:
+        planes: number of planes that it trusts.
+        misfit_mm: RMS distance of the contours from the fitted shape, before that follows them; 0 when not looked at.
+        surface_sd_mm: mean posterior SD of the surface.
+    """
+
+    planes: int
+    misfit_mm: float
+    surface_sd_mm: float
+
+
+def reliability_warnings(
+    usual: Mapping[str, float], figures: Figures, stacks: Sequence[MaskStack], planes: Sequence[Plane], mesh: Mesh
+) -> tuple[str, ...]:
+    """What to tell about drawings and fits that are worse than usual for the model."""
+    thick = thickness_warnings(stacks, planes, mesh)
+    # Contours of thick slices stand where the slice's average crosses one half, off the shape's own sections.
+    unusual = unusual_warnings(usual, replace(figures, misfit_mm=0.0) if thick else figures)
+    return open_warnings(stacks, planes) + thick + unusual
+
+
+def figures_of(
+    model: ShapeModel,
+    found: Fit,
+    stacks: Sequence[MaskStack],
+    observations: Observations,
+    mesh: Mesh,
+    prior: DiscrepancyPrior,
+) -> Figures:
+    """Figures of a fit under the model's own discrepancy, whatever fidelity the caller asked for."""
+    judged = with_discrepancy(model, found, stacks, observations, prior)
+    step = max(1, len(mesh.vertices) // JUDGED_VERTICES)
+    spread = _mean_sd(model, judged, mesh.vertices[::step])
+    return Figures(_planes_used(found, observations), _misfit(judged), spread)
+
+
+def less_trusting(
+    model: ShapeModel,
+    found: Fit,
+    stacks: Sequence[MaskStack],
+    observations: Observations,
+    options: FitOptions,
+    prior: DiscrepancyPrior,
+) -> tuple[ShapeModel, Fit]:
+    """Model and fit with less trust in the drawing when that is rough, otherwise as they are.
+
+    First a single plane that is to blame is looked for, more thoroughly than in any fit. Drawings on thick slices are
+    not judged.
+    """
+    if any(_thickness(stacks[plane.stack], plane) for plane in observations.planes):
+        return model, found
+    if not _is_rough(model, found, stacks, observations, prior):
+        return model, found
+    found = searched(model, observations, found, options)
+    if not _is_rough(model, found, stacks, observations, prior):
+        return model, found
+    lower = ROUGH_SHARE * model.manifest.likelihood_precision
+    doubting = replace(model, manifest=replace(model.manifest, likelihood_precision=lower))
+    return doubting, refit(doubting, observations, found, options)
+
+
+def _is_rough(
+    model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations, prior: DiscrepancyPrior
+) -> bool:
+    usual = highest_usual(model.manifest.usual, "misfit", _planes_used(found, observations))
+    if not np.isfinite(usual):
+        return False
+    return _misfit(with_discrepancy(model, found, stacks, observations, prior)) > usual
+
+
+def _planes_used(found: Fit, observations: Observations) -> int:
+    used = observations.weights > 0
+    if found.plane_weights is not None:
+        used &= found.plane_weights[observations.plane_of] > 0
+    return len(np.unique(observations.plane_of[used]))
+
+
+def _misfit(found: Fit) -> float:
+    """RMS (mm) of what its discrepancy was observed to be."""
+    return 0.0 if found.discrepancy is None else float(np.sqrt(np.mean(np.square(found.discrepancy.residuals))))
+
+
+def _mean_sd(model: ShapeModel, found: Fit, points: Float[np.ndarray, "v 3"]) -> float:
+    """Mean posterior SD (mm) of surface points along their normals."""
+    _, by_parameter, by_point = fitted_jacobians(model, found, points)
+    variance = logit_variance(by_parameter, laplace_covariance(found)) + open_variance(found, points)
+    return float(normal_displacements(np.sqrt(variance)[:, None], by_point).mean())
+
+
+def highest_usual(usual: Mapping[str, float], name: str, planes: int) -> float:
+    """Highest usual value of a figure (mm) with so many planes; infinite for a model that does not say."""
+    if f"{name}_mm" not in usual:
+        return float("inf")
+    return float(usual[f"{name}_mm"] * (planes / USUAL_PLANES) ** usual[f"{name}_exponent"])
+
+
+def unusual_warnings(usual: Mapping[str, float], figures: Figures) -> tuple[str, ...]:
+    """What to tell of a figure that is higher than usual: the misfit first, for it is a reason of the other."""
+    misfit, spread = (highest_usual(usual, name, figures.planes) for name in ("misfit", "surface_sd"))
+    if figures.misfit_mm > misfit:
+        sentence = (
+            f"The drawn contours lie {figures.misfit_mm:.2f} mm (RMS) from the fitted shape, where up to "
+            f"{misfit:.2f} mm is usual; the drawing is rough or contradicts itself, do not rely on details."
+        )
+        return (sentence,)
+    if figures.surface_sd_mm > spread:
+        sentence = (
+            f"The drawing leaves the surface uncertain by {figures.surface_sd_mm:.2f} mm on average, where up to "
+            f"{spread:.2f} mm is usual with as many planes; do not rely on it away from them."
+        )
+        return (sentence,)
+    return ()
+
+
+def open_share(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> float:
+    """Share of the drawn contours' length that runs along the border of an image or of what was looked at."""
+    lengths = np.array([_contour_lengths(stacks[plane.stack], plane) for plane in planes]).reshape(-1, 2).sum(axis=0)
+    return float(lengths[1] / lengths.sum()) if lengths.any() else 0.0
+
+
+def open_warnings(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> tuple[str, ...]:
+    """What to tell when images end inside the object."""
+    share = open_share(stacks, planes)
+    if share <= OPEN_SHARE:
+        return ()
+    sentence = (
+        f"About {100 * share:.0f} % of the drawn contours is open, cut off by the border of an image; do not rely on "
+        "the surface beyond."
+    )
+    return (sentence,)
+
+
+def _contour_lengths(stack: MaskStack, plane: Plane) -> tuple[float, float]:
+    """Length (mm) of a section's contour that is closed, and that is open."""
+    inside = np.pad(section_of(stack.foreground, plane), 1)
+    seen = np.pad(~section_of(stack.excluded, plane), 1)
+    closed, open_ = 0.0, 0.0
+    for axis, step in enumerate(np.delete(stack.grid.spacing, plane.axis)[::-1]):
+        (a, b), (seen_a, seen_b) = _neighbours(inside & seen, axis), _neighbours(seen, axis)
+        closed += float(step * ((a != b) & seen_a & seen_b).sum())
+        open_ += float(step * ((a & ~seen_b) | (b & ~seen_a)).sum())
+    return closed, open_
+
+
+def _neighbours(values: Bool[np.ndarray, "a b"], axis: int) -> tuple[Bool[np.ndarray, "c d"], Bool[np.ndarray, "c d"]]:
+    along = np.moveaxis(values, axis, 0)
+    return along[:-1], along[1:]
+
+
+def thickness_warnings(stacks: Sequence[MaskStack], planes: Sequence[Plane], mesh: Mesh) -> tuple[str, ...]:
+    """What to tell when most slices are thick for the object."""
+    size = float(np.cbrt(1000.0 * volume_ml(mesh)))
+    thickness = np.array([_thickness(stacks[plane.stack], plane) for plane in planes])
+    if np.median(thickness) <= THICK_SHARE * size:
+        return ()
+    sentence = (
+        f"Slices are {np.median(thickness):.1f} mm thick, much compared with the object; what changes within a slice "
+        "was not seen, do not rely on details."
+    )
+    return (sentence,)
+
+
+def _thickness(stack: MaskStack, plane: Plane) -> float:
+    """Thickness (mm) of a slice, 0 when it is of the order of its voxels' size in the plane."""
+    spacing = stack.grid.spacing
+    thick = spacing[plane.axis] > THICK_RATIO * np.delete(spacing, plane.axis).max()
+    return float(spacing[plane.axis] * thick)
