@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from model.inference.agreement import plane_warnings
+from model.inference.fitting import FitOptions, fit, searched
 from model.inference.mask_stack import MaskStack, Plane
 from model.inference.mesh import Mesh
+from model.inference.observations import observe
 from model.inference.reconstruction import Options, reconstruct
 from model.inference.reliability import (
     ROUGH_SHARE,
@@ -22,7 +24,7 @@ from tests.analytic_model import ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import cube_around, rotation
 from training.cohorts.cohort import Case
-from training.perturb import cut_off, noisy, parallel, sections_of
+from training.perturb import cut_off, noisy, parallel, sections_of, with_wrong
 from training.sparsify import for_evaluation
 from training.usual import sound_drawings, usual_figures
 
@@ -133,3 +135,18 @@ def test_thick_slices_are_told():
 def test_a_doubted_plane_is_named():
     (sentence,) = plane_warnings([], Plane(2, 0, 0))
     assert "mask[2] axis 0 index 0 agrees less with the others" in sentence
+
+
+@pytest.mark.parametrize("wrong", [0, 2, 4])
+def test_a_thorough_search_names_the_wrong_plane(wrong):
+    drawn = with_wrong(FIVE, wrong, "shifted", np.random.default_rng(wrong), FIVE)
+    observations = observe(drawn.stacks, drawn.planes, budget=2500, seed=0)
+    found = searched(PLAIN, observations, fit(PLAIN, observations, FitOptions(robust=False)), FitOptions())
+    np.testing.assert_array_equal(np.flatnonzero(found.plane_weights == 0), [wrong])
+    assert searched(PLAIN, observations, found, FitOptions()) is found
+
+
+def test_badly_placed_planes_leave_the_surface_uncertain():
+    close = parallel(CASES[0].mask, GRID, 29).only(range(10, 15))
+    told = answered(close).warnings
+    assert any("uncertain by" in sentence or "rests on the population alone" in sentence for sentence in told)
