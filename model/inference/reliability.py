@@ -75,7 +75,9 @@ def figures_of(
     prior: DiscrepancyPrior,
 ) -> Figures:
     """Figures of a fit under the model's own discrepancy, whatever fidelity the caller asked for."""
-    judged = with_discrepancy(model, found, stacks, observations, prior)
+    made = found.discrepancy
+    same = made is not None and (made.covariance, made.noise_mm) == (prior.covariance, prior.noise_mm)
+    judged = found if same else with_discrepancy(model, found, stacks, observations, prior)
     step = max(1, len(mesh.vertices) // JUDGED_VERTICES)
     spread = _mean_sd(model, judged, mesh.vertices[::step])
     return Figures(_planes_used(found, observations), _misfit(judged), spread)
