@@ -45,8 +45,8 @@ class Manifest:
         resolution_mm: default grid step of the surface.
         calibration: how the likelihood precision was chosen; empty when it was not.
         likelihood_precision: information of one mm^2 of annotated plane, 1/mm^2; calibrated on validation shapes.
-        discrepancy: ``spread_mm`` and ``fidelity`` of what the code leaves unexplained at contours, chosen on validation
-            shapes (`model.inference.discrepancy`); empty when they were not.
+        discrepancy: ``spread_mm`` and ``fidelity`` of what the code leaves unexplained at contours
+            (`model.inference.discrepancy`), chosen on validation shapes; empty when they were not.
         usual: highest figures that answers from sound drawings usually have (`model.inference.reliability`), estimated
             on validation shapes: ``misfit_mm`` and ``surface_sd_mm`` with five planes, ``misfit_exponent`` and
             ``surface_sd_exponent`` in the number of planes; not judged when empty.

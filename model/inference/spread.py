@@ -40,7 +40,7 @@ class SurfaceSpread:
         variance = np.square(self.factors).sum(axis=1)
         if self.local is not None:
             variance = variance + np.square(self.local.reach) * self.local.discrepancy.variance(self.local.canonical)
-        return np.sqrt(variance)
+        return np.asarray(np.sqrt(variance))
 
     def sd_of(self, slope: Float[np.ndarray, "v"]) -> float:
         """SD of a figure that changes by ``slope_v`` for a mm of outward movement of vertex v."""

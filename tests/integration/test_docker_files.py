@@ -140,13 +140,15 @@ def installation(build_context: Path, tmp_path_factory: pytest.TempPathFactory) 
     target = tmp_path_factory.mktemp("image") / "opt"
     environment = {**os.environ, "PYTHON": sys.executable}
     script = build_context / "docker" / "install.sh"
-    done = run([script, target, "cluster"], cwd=build_context, env=environment, capture_output=True, text=True, check=False)
+    command = [script, target, "cluster"]
+    done = run(command, cwd=build_context, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return target / "bin"
 
 
 def test_image_installs_with_that_script(repository: Path) -> None:
-    assert "RUN docker/install.sh /opt/morphoflow cluster\n" in (repository / "docker" / "service.Dockerfile").read_text()
+    image = (repository / "docker" / "service.Dockerfile").read_text()
+    assert "RUN docker/install.sh /opt/morphoflow cluster\n" in image
 
 
 @pytest.mark.slow

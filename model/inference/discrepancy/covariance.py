@@ -95,4 +95,4 @@ class Covariance:
 
 
 def _falls(axis: Float[np.ndarray, "i"], coordinate: Float[np.ndarray, "m"], length: float) -> Float[np.ndarray, "i m"]:
-    return np.exp(-0.5 * np.square((axis[:, None] - coordinate) / length)).astype(np.float32)
+    return np.asarray(np.exp(-0.5 * np.square((axis[:, None] - coordinate) / length)), np.float32)

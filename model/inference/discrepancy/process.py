@@ -102,7 +102,7 @@ class Discrepancy:
             yield np.arange(len(canonical)), np.arange(len(self.points))
             return
         cells = cells_of(canonical, PATCH_SHARE * min(self.covariance.lengths))
-        _, near = cKDTree(self.points).query(means_of(cells, canonical), k=NEAREST)
+        near = np.asarray(cKDTree(self.points).query(means_of(cells, canonical), k=NEAREST)[1])
         groups = np.split(np.argsort(cells, kind="stable"), np.cumsum(np.bincount(cells))[:-1])
         yield from zip(groups, near, strict=True)
 
