@@ -11,6 +11,7 @@ from rich.table import Table
 
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
+from model.inference.decimation import decimated
 from model.inference.fitting import MirrorRule
 from model.inference.observations import MaskStack
 from model.inference.reconstruction import Options, UncertaintyRule
@@ -54,6 +55,9 @@ def reconstruct(
         typer.Option(min=0.0, max=1.0, help="0 trusts the model, 1 the slices; the model's when left out."),
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Surface to write; its suffix says the format.")] = None,
+    max_error_mm: Annotated[
+        float, typer.Option(min=0.0, max=10.0, help="Write fewer triangles, at most this far (mm) from the surface.")
+    ] = 0.0,
     segmentation: Annotated[Path | None, typer.Option(help="Label map to write (.nii.gz).")] = None,
     entropy: Annotated[Path | None, typer.Option(help="Voxel entropy to write (.nii.gz).")] = None,
     force: ForceOption = False,
@@ -74,7 +78,7 @@ def reconstruct(
         watch("masks")
         stacks = _read(settings, masks, parse_labels(label or []))
         outcome = use_cases.reconstruct(registry.get(model), stacks, options, watch)
-        _write_mesh(outcome, output, format)
+        _write_mesh(outcome, output, format, max_error_mm)
         _write_volume(registry, outcome, segmentation, use_cases.segmentation, settings.max_voxels)
         _write_volume(registry, outcome, entropy, use_cases.entropy_map, settings.max_voxels)
     summary = summary_of(outcome)
@@ -131,11 +135,12 @@ def _read(settings: Settings, masks: list[Path], labels: frozenset[int] | None) 
     return tuple(stack for number, path in enumerate(masks) for stack in read(path, f"mask[{number}]", labels))
 
 
-def _write_mesh(outcome: Outcome, path: Path | None, format: str) -> None:
+def _write_mesh(outcome: Outcome, path: Path | None, format: str, max_error_mm: float) -> None:
     if path is None:
         return
     metadata = {"model": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest}
-    path.write_bytes(write_mesh(outcome.reconstruction.mesh, format, space="RAS", metadata=metadata))
+    mesh = decimated(outcome.reconstruction.mesh, max_error_mm)
+    path.write_bytes(write_mesh(mesh, format, space="RAS", metadata=metadata))
 
 
 def _write_volume(

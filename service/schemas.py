@@ -62,6 +62,9 @@ class MeshQuery(_Closed):
     """Query of a mesh."""
 
     format: MeshFormat = Field(MeshFormat.PLY, description="file format")
+    max_error_mm: float = Field(
+        0.0, ge=0.0, le=10.0, description="fewer triangles, none of them farther than this (mm) from the full surface"
+    )
 
 
 class VolumeQuery(_Closed):

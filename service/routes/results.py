@@ -84,7 +84,7 @@ def delete_result(identifier: Identifier, services: WithServices) -> Response:
 
 def read_mesh(identifier: Identifier, query: Annotated[MeshQuery, Query()], services: WithServices) -> Response:
     """The watertight surface in the input's world, RAS mm."""
-    data = mesh_bytes(services, services.store.load(identifier), query.format)
+    data = mesh_bytes(services, services.store.load(identifier), query.format, query.max_error_mm)
     headers = attachment(f"reconstruction.{query.format.value}")
     return Response(data, media_type=MESH_MEDIA_TYPES[query.format], headers=headers)
 

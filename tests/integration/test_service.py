@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from model.inference.decimation import hausdorff_mm
+from model.inference.mesh import mesh_of
 from service.ports import MeshFormat, SampleFormat
 from service.routes.responses import DIRECT_FORMATS, MESH_MEDIA_TYPES
 from tests.analytic_model import MEAN_AXES, EllipsoidDecoder
@@ -125,6 +127,22 @@ def test_every_mesh_format_has_its_media_type(client, summary, format):
     assert answer.status_code == 200
     assert answer.headers["content-type"].split(";")[0] == MESH_MEDIA_TYPES[format]
     assert answer.content
+
+
+def test_a_bound_of_the_error_leaves_fewer_triangles_near_the_surface(client, summary):
+    full, fewer = (
+        trimesh.load(io.BytesIO(client.get(summary["links"]["mesh"], params=query).content), file_type="ply")
+        for query in ({}, {"max_error_mm": 0.2})
+    )
+    assert len(fewer.faces) < 0.7 * len(full.faces)
+    assert fewer.is_watertight
+    surfaces = [mesh_of(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, int)) for mesh in (full, fewer)]
+    assert hausdorff_mm(*surfaces) <= 0.2 + 1e-4
+
+
+@pytest.mark.parametrize("error", ["-0.1", "11", "nan"])
+def test_an_error_bound_out_of_its_range_is_refused(client, summary, error):
+    problem(client.get(summary["links"]["mesh"], params={"max_error_mm": error}), 422)
 
 
 def test_equal_requests_give_equal_bytes(client, created):

@@ -42,6 +42,13 @@ def test_the_suffix_says_the_format(mask, tmp_path, format):
     assert target.stat().st_size > 100
 
 
+def test_a_surface_may_have_fewer_triangles(mask, tmp_path):
+    full, fewer = tmp_path / "full.ply", tmp_path / "fewer.ply"
+    assert run("reconstruct", mask, "--output", full) == 0
+    assert run("reconstruct", mask, "--output", fewer, "--max-error-mm", 0.2) == 0
+    assert len(trimesh.load(fewer).faces) < 0.7 * len(trimesh.load(full).faces)
+
+
 def test_a_reconstruction_writes_all_that_is_asked_for(mask, tmp_path, capsys):
     surface, labels, entropy = (tmp_path / name for name in ("s.ply", "l.nii.gz", "e.nii.gz"))
     words = ("--output", surface, "--segmentation", labels, "--entropy", entropy, "--seed", 4, "--json")
