@@ -34,7 +34,7 @@ TRIAL_RATIO = 2.5
 #: The plane blamed gains so many times, and so many nats, more than is typical.
 BLAME_RATIO, BLAME_NATS = 4.0, 20.0
 #: The plane doubted gains so many times, and so many nats, more.
-DOUBT_RATIO, DOUBT_NATS = 2.5, 15.0
+DOUBT_RATIO, DOUBT_NATS = 3.0, 15.0
 #: A thorough search is for drawings of no more planes than this.
 MOST_SEARCHED = 12
 #: What a plane's gain is held against is at least this share of the median plane's.
