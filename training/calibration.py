@@ -1,10 +1,10 @@
 """How much a drawn mm^2 is worth and how far the slices are followed: chosen on validation shapes.
 
-Neighbouring voxels are not independent, so the sum of their log likelihoods overstates what a slice tells
-(likelihood precision), and what the code leaves unexplained at a contour is partly the shape's, partly the annotator's
-(spread and fidelity of the discrepancy). Precision and fidelity are those that leave the fewest voxels near the true
-surface on its wrong side (the lowest of those that hardly differ); the spread, which moves no surface, is the one with the lowest cross-entropy of the posterior
-mean occupancy there, a proper score.
+Neighbouring voxels are not independent, so the sum of their log likelihoods overstates what a slice tells (likelihood
+precision), and what the code leaves unexplained at a contour is partly the shape's, partly the annotator's (spread and
+fidelity of the discrepancy). Precision and fidelity are those that leave the fewest voxels near the true surface on its
+wrong side, the lowest of those that hardly differ; the spread, which moves no surface, is the one with the lowest
+cross-entropy of the posterior mean occupancy there, a proper score.
 """
 
 from collections.abc import Callable, Iterator, Sequence
