@@ -34,10 +34,11 @@ class FolderBlobs:
         return self._path(key).is_file()
 
     def list(self, prefix: str) -> Iterable[str]:
-        """Keys below a folder."""
-        for path in self._path(prefix).rglob("*"):
-            if path.is_file() and not path.name.startswith(_TEMPORARY):
-                yield path.relative_to(self._folder).as_posix()
+        """Keys below a folder; folders that others remove meanwhile are passed over."""
+        for folder, _, names in os.walk(self._path(prefix)):
+            for name in names:
+                if not name.startswith(_TEMPORARY):
+                    yield (Path(folder) / name).relative_to(self._folder).as_posix()
 
     def delete(self, prefix: str) -> None:
         """Remove everything below a folder."""
