@@ -32,11 +32,11 @@ def test_sections_of_a_ball_are_discs(direction, height):
     inside = stack.grid.to_world(np.argwhere(stack.foreground).astype(float))
     middle, radius = CENTRE + height * normal, np.sqrt(RADIUS**2 - height**2)
     np.testing.assert_allclose(inside @ normal, middle @ normal, atol=1e-9)
-    np.testing.assert_allclose(
-        inside.mean(axis=0), middle, atol=0.5
-    )  # half a voxel: labels are those of the nearest one
+    # Labels are those of the nearest voxel, which may lie half a voxel beside the plane.
+    np.testing.assert_allclose(inside.mean(axis=0), middle, atol=0.5)
     assert np.linalg.norm(inside - middle, axis=1).max() < radius + 1.0
-    assert stack.foreground.sum() == pytest.approx(np.pi * radius**2, rel=0.1)
+    tolerance = np.pi * (abs(height) + 0.06 * radius**2)
+    assert stack.foreground.sum() == pytest.approx(np.pi * radius**2, abs=tolerance)
 
 
 def test_a_section_along_the_voxels_is_the_slice():
