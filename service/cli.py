@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 import uvicorn
 import yaml
+from threadpoolctl import threadpool_limits
 
 from model.errors import CohortError, InputError, MorphoFlowError, NotFound
 from service.app import create_app, interface_document, program_version
@@ -41,6 +42,8 @@ def main(arguments: Sequence[str] | None = None, open_registry: OpenRegistry = l
     Returns:
         The exit status.
     """
+    # The factorisations of a fit are small: BLAS spends longer waiting for its own threads than computing.
+    threadpool_limits(limits=1, user_api="blas")
     words = list(sys.argv[1:] if arguments is None else arguments)
     app = build_app()
     missing = load_plugins(app, entry_points(group=COMMAND_GROUP))
