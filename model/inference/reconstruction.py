@@ -13,7 +13,7 @@ from model.bundle import ShapeModel
 from model.errors import InvalidMask, InvalidParameter
 from model.inference.agreement import plane_warnings, sections_of
 from model.inference.coverage import coverage_warnings
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_prior, with_discrepancy
+from model.inference.discrepancy.conditioning import discrepancy_prior, with_discrepancy
 from model.inference.ensemble import fit_ensemble
 from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
 from model.inference.mesh import Mesh
@@ -133,7 +133,9 @@ def reconstruct(
             part="mask",
         )
     watch("uncertainty")
-    state = _state(model, stacks, observations, found, options, prior)
+    state = _state(
+        model, observations, found, options, lambda fit: with_discrepancy(model, fit, stacks, drawing, prior)
+    )
     spread = surface_spread(model, state, mesh)
     if spread is not None:
         mesh = replace(mesh, scalars={"surface_sd_mm": spread.sd()})
@@ -175,17 +177,12 @@ def _check(options: Options) -> None:
 
 
 def _state(
-    model: ShapeModel,
-    stacks: Sequence[MaskStack],
-    observations: Observations,
-    found: Fit,
-    options: Options,
-    prior: DiscrepancyPrior,
+    model: ShapeModel, observations: Observations, found: Fit, options: Options, correct: Callable[[Fit], Fit]
 ) -> ShapeState:
+    """The fit and its posterior; the members of an ensemble are corrected by the drawing as the fit was."""
     if options.uncertainty == "ensemble":
         members = fit_ensemble(model, observations, found, options.seed)
-        corrected = (with_discrepancy(model, member, stacks, observations, prior) for member in members)
-        return ShapeState((found, *corrected), None)
+        return ShapeState((found, *map(correct, members)), None)
     return ShapeState((found,), laplace_covariance(found) if options.uncertainty == "laplace" else None)
 
 

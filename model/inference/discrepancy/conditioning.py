@@ -125,7 +125,7 @@ def _evidence(model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observ
     points = np.concatenate([contour, wrong.points])
     if not len(points):
         return wrong
-    kinds = np.concatenate([2 * plane_of, np.ones(len(wrong.distances), int)])
+    kinds = np.concatenate([plane_of + 1, np.zeros(len(wrong.distances), int)])
     cells = _few_cells(found.pose.to_canonical(points), kinds)
     distances = np.concatenate([np.zeros(len(contour)), wrong.distances])
     return _Evidence(means_of(cells, points), means_of(cells, distances[:, None])[:, 0])

@@ -7,6 +7,7 @@ import numpy as np
 from model.geometry import Grid
 from model.inference.fitting import FitOptions, fit
 from model.inference.observations import MaskStack, find_planes, observe
+from model.inference.reconstruction import Options, reconstruct
 from model.inference.thick_slices import at_medians, columns_of, through_thickness
 from tests.analytic_model import ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
@@ -83,3 +84,15 @@ def test_planes_that_were_left_out_stay_out():
     found = replace(fit(MODEL, observations, OPTIONS), plane_weights=trust)
     settled, _ = through_thickness(MODEL, found, [stack], observations, OPTIONS)
     np.testing.assert_array_equal(settled.plane_weights, trust)
+
+
+def test_the_drawing_corrects_members_of_an_ensemble_in_its_own_planes():
+    """What is drawn stands in the slice's middle, wherever the fit placed the observations."""
+    stack = thick_stack()
+    foreground = stack.foreground.copy()
+    foreground[28:40, 14:30, 4] = True
+    lobed = replace(stack, foreground=foreground)
+    answer = reconstruct(MODEL, [lobed], Options(annotated="nonempty", uncertainty="ensemble"))
+    for found in answer.state.fits:
+        index = stack.grid.to_index(found.pose.to_world(found.discrepancy.points))[:, 2]
+        np.testing.assert_allclose(index, np.rint(index), atol=1e-6)
