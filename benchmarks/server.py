@@ -69,7 +69,7 @@ def serving(models: tuple[Path, ...], settings: Mapping[str, str] | None = None)
             process = subprocess.Popen(command, env=environment, stderr=stream)
         try:
             with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=REQUEST_LIMIT_S) as client:
-                _wait_until_ready(client, process, log)
+                wait_until_ready(client, process, log)
                 yield Server(client, process, log)
         finally:
             process.send_signal(signal.SIGTERM)
@@ -80,7 +80,12 @@ def serving(models: tuple[Path, ...], settings: Mapping[str, str] | None = None)
                 process.wait()
 
 
-def _wait_until_ready(client: httpx.Client, process: subprocess.Popen[bytes], log: Path) -> None:
+def wait_until_ready(client: httpx.Client, process: subprocess.Popen[bytes], log: Path) -> None:
+    """Return once /readyz says so.
+
+    Raises:
+        SystemExit: the process ended or took too long; with the last line that it wrote.
+    """
     limit = time.monotonic() + START_LIMIT_S
     while time.monotonic() < limit and process.poll() is None:
         try:
@@ -88,7 +93,7 @@ def _wait_until_ready(client: httpx.Client, process: subprocess.Popen[bytes], lo
                 return
         except httpx.TransportError:
             pass
-        time.sleep(0.1)
+        time.sleep(0.05)
     said = log.read_text(errors="replace").strip().splitlines()[-1:]
     raise SystemExit(f"The service did not become ready: {''.join(said)}")
 

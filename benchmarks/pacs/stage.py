@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,8 +12,9 @@ from pathlib import Path
 import httpx
 
 from benchmarks.pacs.orthanc import TITLE, Orthanc
+from benchmarks.server import wait_until_ready
 
-START_LIMIT_S, STOP_LIMIT_S = 120.0, 60.0
+STOP_LIMIT_S = 60.0
 _PROGRAM = "import sys; from service.cli import main; sys.exit(main(sys.argv[1:]))"
 _FILE = """
 retry_first_s = 0.2
@@ -52,6 +52,11 @@ class Place:
         """The file that says how it stands among archives."""
         return self.folder / "pacs.toml"
 
+    @property
+    def log(self) -> Path:
+        """What the service writes."""
+        return self.folder / "service.log"
+
     def environment(self) -> dict[str, str]:
         """Settings of the service's processes."""
         return {
@@ -83,7 +88,7 @@ def write_file(place: Place, archive: str) -> None:
 
 def start(place: Place) -> subprocess.Popen[bytes]:
     """The service and its worker in processes of their own session."""
-    with (place.folder / "service.log").open("ab") as log:
+    with place.log.open("ab") as log:
         command = [sys.executable, "-c", _PROGRAM, "serve"]
         return subprocess.Popen(command, env=place.environment(), stderr=log, start_new_session=True)
 
@@ -100,7 +105,7 @@ def running_service(place: Place) -> Iterator[httpx.Client]:
     process = start(place)
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{place.http_port}", timeout=120.0) as client:
-            wait_until_ready(client, process)
+            wait_until_ready(client, process, place.log)
             yield client
     finally:
         process.send_signal(signal.SIGTERM)
@@ -108,16 +113,3 @@ def running_service(place: Place) -> Iterator[httpx.Client]:
             process.wait(STOP_LIMIT_S)
         except subprocess.TimeoutExpired:
             kill(process)
-
-
-def wait_until_ready(client: httpx.Client, process: subprocess.Popen[bytes]) -> None:
-    """Return once /readyz says so."""
-    limit = time.monotonic() + START_LIMIT_S
-    while time.monotonic() < limit and process.poll() is None:
-        try:
-            if client.get("/readyz").is_success:
-                return
-        except httpx.TransportError:
-            pass
-        time.sleep(0.05)
-    raise SystemExit("The service did not become ready; its log stands in its folder.")

@@ -19,7 +19,8 @@ from pynetdicom import AE
 
 from benchmarks.pacs.drawings import EXAMPLE, as_seg, placed, series_around, three_planes
 from benchmarks.pacs.orthanc import Orthanc, free_ports, running_orthanc
-from benchmarks.pacs.stage import Place, by_dicomweb, kill, start, wait_until_ready, write_file
+from benchmarks.pacs.stage import Place, by_dicomweb, kill, start, write_file
+from benchmarks.server import wait_until_ready
 from model.geometry import Grid
 from service.adapters.dicom.results import RESULTS
 from service.adapters.pacs.sop_classes import PROPOSED_SYNTAXES
@@ -94,7 +95,7 @@ def _play(
     waiting = {str(drawing.SOPInstanceUID): drawing for drawing in drawings}
     process, images = start(place), _instances(orthanc)
     with httpx.Client(base_url=f"http://127.0.0.1:{place.http_port}", timeout=60.0) as client:
-        wait_until_ready(client, process)
+        wait_until_ready(client, process, place.log)
         while True:
             _send_some(waiting, place.dicom_port, count)
             count.objects = _instances(orthanc) - images
