@@ -37,6 +37,9 @@ OpenRegistry = Callable[[Settings], ModelRegistry]
 
 ModelOption = Annotated[str | None, typer.Option(help="Model name; may be left out when only one is loaded.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
+FidelityOption = Annotated[
+    float | None, typer.Option(min=0.0, max=1.0, help="0 trusts the model, 1 the slices; the model's when left out.")
+]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
 
 
@@ -50,10 +53,7 @@ def reconstruct(
     mirror: Annotated[MirrorRule, typer.Option(help="Whether left and right are exchanged.")] = "never",
     resolution_mm: Annotated[float | None, typer.Option(help="Grid step of the surface (mm).")] = None,
     seed: Annotated[int, typer.Option(min=0, max=use_cases.MAX_SEED, help="Makes the answer repeatable.")] = 0,
-    fidelity: Annotated[
-        float | None,
-        typer.Option(min=0.0, max=1.0, help="0 trusts the model, 1 the slices; the model's when left out."),
-    ] = None,
+    fidelity: FidelityOption = None,
     output: Annotated[Path | None, typer.Option(help="Surface to write; its suffix says the format.")] = None,
     max_error_mm: Annotated[
         float, typer.Option(min=0.0, max=10.0, help="Write fewer triangles, at most this far (mm) from the surface.")

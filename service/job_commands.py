@@ -13,7 +13,7 @@ from model.errors import InvalidParameter
 from model.inference.fitting import MirrorRule
 from model.inference.reconstruction import UncertaintyRule
 from service import use_cases
-from service.commands import ForceOption, JsonOption, ModelOption
+from service.commands import FidelityOption, ForceOption, JsonOption, ModelOption
 from service.console import bar, echo_json, require_free
 from service.errors import NotReady
 from service.job_files import JobFiles
@@ -90,6 +90,7 @@ def reconstruct_job(
     mirror: Annotated[MirrorRule, typer.Option(help="Whether left and right are exchanged.")] = "never",
     resolution_mm: Annotated[float | None, typer.Option(help="Grid step of the surface (mm).")] = None,
     seed: Annotated[int, typer.Option(min=0, max=use_cases.MAX_SEED, help="Makes the answer repeatable.")] = 0,
+    fidelity: FidelityOption = None,
     key: KeyOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -107,6 +108,7 @@ def reconstruct_job(
         "mirror": mirror,
         "resolution_mm": resolution_mm,
         "seed": seed,
+        "fidelity": fidelity,
     }
     _begin(settings, RECONSTRUCTIONS_JOB, argument, _archive(masks), key, output, as_json=as_json)
 

@@ -12,7 +12,7 @@ from service.ports import RECONSTRUCTIONS_JOB, SAMPLES_JOB, MeshFormat, SampleFo
 from service.schemas import Seed, SpacingMm, parse_annotated, parse_labels
 
 _OF_SAMPLES = ("count", "temperature", "spacing_mm")
-_OF_RECONSTRUCTIONS = ("archive", "label", "annotated", "uncertainty", "mirror", "resolution_mm")
+_OF_RECONSTRUCTIONS = ("archive", "label", "annotated", "uncertainty", "mirror", "resolution_mm", "fidelity")
 
 
 class JobForm(BaseModel):
@@ -41,6 +41,7 @@ class JobForm(BaseModel):
     )
     mirror: Literal["auto", "never", "always"] = Field("never", description="of reconstructions: as of a single one")
     resolution_mm: SpacingMm | None = Field(None, description="of reconstructions: as of a single one")
+    fidelity: float | None = Field(None, ge=0.0, le=1.0, description="of reconstructions: as of a single one")
 
     def argument(self, model: str) -> dict[str, Any]:
         """The job's argument, checked, with the model that it was given to.

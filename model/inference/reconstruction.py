@@ -13,7 +13,7 @@ from model.bundle import ShapeModel
 from model.errors import InvalidMask, InvalidParameter
 from model.inference.agreement import plane_warnings, sections_of
 from model.inference.coverage import coverage_warnings
-from model.inference.discrepancy.conditioning import discrepancy_prior, with_discrepancy
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_prior, with_discrepancy
 from model.inference.ensemble import fit_ensemble
 from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
 from model.inference.mesh import Mesh
@@ -117,13 +117,13 @@ def reconstruct(
     planes = find_planes(stacks, options.annotated)
     drawing = observe(stacks, planes, budget=OBSERVATION_BUDGET, seed=options.seed)
     watch("fit")
-    prior = discrepancy_prior(model.manifest, options.fidelity)
-    choices = FitOptions(mirror=options.mirror)
-    fitted = fit(model, drawing, choices)
-    settled, observations = through_thickness(model, fitted, stacks, drawing, choices)
     usual = discrepancy_prior(model.manifest)
-    model, settled = less_trusting(model, settled, stacks, observations, choices, usual)
-    found = with_discrepancy(model, settled, stacks, drawing, prior)
+    model, settled, observations = _settled(model, stacks, drawing, FitOptions(mirror=options.mirror), usual)
+
+    def correct(fit: Fit) -> Fit:
+        return with_discrepancy(model, fit, stacks, drawing, discrepancy_prior(model.manifest, options.fidelity))
+
+    found = correct(settled)
     watch("surface")
     mesh = surface_of(model, found.latent, found.pose, options.resolution_mm, found.discrepancy)
     if mesh.is_empty:
@@ -133,9 +133,7 @@ def reconstruct(
             part="mask",
         )
     watch("uncertainty")
-    state = _state(
-        model, observations, found, options, lambda fit: with_discrepancy(model, fit, stacks, drawing, prior)
-    )
+    state = _state(model, observations, found, options, correct)
     spread = surface_spread(model, state, mesh)
     if spread is not None:
         mesh = replace(mesh, scalars={"surface_sd_mm": spread.sd()})
@@ -158,6 +156,15 @@ def reconstruct(
         + coverage_warnings(trusted, mesh.vertices)
         + reliability_warnings(model.manifest.usual, figures, stacks, observations.planes, mesh),
     )
+
+
+def _settled(
+    model: ShapeModel, stacks: Sequence[MaskStack], drawing: Observations, options: FitOptions, usual: DiscrepancyPrior
+) -> tuple[ShapeModel, Fit, Observations]:
+    """Fit of code and pose, the model with as much trust in the drawing as it deserves, and observations in place."""
+    found, observations = through_thickness(model, fit(model, drawing, options), stacks, drawing, options)
+    trusting, found = less_trusting(model, found, stacks, observations, options, usual)
+    return trusting, found, observations
 
 
 def _check(options: Options) -> None:

@@ -26,7 +26,7 @@ from model.inference.posterior import (
     normal_displacements,
     open_variance,
 )
-from model.inference.thick_slices import THICK_RATIO
+from model.inference.thick_slices import thickness_mm
 
 #: Contours of which more than this share is open are called cut off: sound drawings of 16 validation shapes have none,
 #: those that end at three quarters of the object 0.07 to 0.22.
@@ -96,7 +96,7 @@ def less_trusting(
     First a single plane that is to blame is looked for, more thoroughly than in any fit. Drawings on thick slices are
     not judged.
     """
-    if any(_thickness(stacks[plane.stack], plane) for plane in observations.planes):
+    if any(thickness_mm(stacks[plane.stack], plane) for plane in observations.planes):
         return model, found
     if not _is_rough(model, found, stacks, observations, prior):
         return model, found
@@ -199,7 +199,7 @@ def _neighbours(values: Bool[np.ndarray, "a b"], axis: int) -> tuple[Bool[np.nda
 def thickness_warnings(stacks: Sequence[MaskStack], planes: Sequence[Plane], mesh: Mesh) -> tuple[str, ...]:
     """What to tell when most slices are thick for the object."""
     size = float(np.cbrt(1000.0 * volume_ml(mesh)))
-    thickness = np.array([_thickness(stacks[plane.stack], plane) for plane in planes])
+    thickness = np.array([thickness_mm(stacks[plane.stack], plane) for plane in planes])
     if np.median(thickness) <= THICK_SHARE * size:
         return ()
     sentence = (
@@ -207,10 +207,3 @@ def thickness_warnings(stacks: Sequence[MaskStack], planes: Sequence[Plane], mes
         "was not seen, do not rely on details."
     )
     return (sentence,)
-
-
-def _thickness(stack: MaskStack, plane: Plane) -> float:
-    """Thickness (mm) of a slice, 0 when it is of the order of its voxels' size in the plane."""
-    spacing = stack.grid.spacing
-    thick = spacing[plane.axis] > THICK_RATIO * np.delete(spacing, plane.axis).max()
-    return float(spacing[plane.axis] * thick)

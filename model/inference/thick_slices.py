@@ -54,7 +54,12 @@ def at_medians(
     return replace(observations, points=moved[median, np.arange(len(median))])
 
 
-def _through(stack: MaskStack, plane: Plane) -> Float[np.ndarray, "3"]:
+def thickness_mm(stack: MaskStack, plane: Plane) -> float:
+    """Thickness of a slice, 0 when it is of the order of its voxels' size in the plane."""
     spacing = stack.grid.spacing
     thick = spacing[plane.axis] > THICK_RATIO * np.delete(spacing, plane.axis).max()
-    return np.asarray(stack.grid.affine[:3, plane.axis], float) * float(thick)
+    return float(spacing[plane.axis] * thick)
+
+
+def _through(stack: MaskStack, plane: Plane) -> Float[np.ndarray, "3"]:
+    return np.asarray(thickness_mm(stack, plane) * stack.grid.directions[:, plane.axis])
