@@ -15,6 +15,8 @@ from typing import Any
 import httpx
 
 TITLE = "ORTHANC"
+#: Where dcmtk is: pynetdicom brings a program called storescu too, with other options.
+SYSTEM_PATH = "/usr/local/bin:/usr/bin:/bin"
 PLUGIN = Path("/usr/share/orthanc/plugins/libOrthancDicomWeb.so")
 START_LIMIT_S, STOP_LIMIT_S = 60.0, 30.0
 #: Forwards drawings, but not results, to the service.
@@ -61,8 +63,8 @@ class Orthanc:
 
 
 def is_installed() -> bool:
-    """Whether Orthanc, its plugin and storescu are there."""
-    return all(map(shutil.which, ("Orthanc", "storescu"))) and PLUGIN.exists()
+    """Whether Orthanc, its plugin and dcmtk's storescu are there."""
+    return bool(shutil.which("Orthanc") and shutil.which("storescu", path=SYSTEM_PATH)) and PLUGIN.exists()
 
 
 def free_ports(count: int) -> list[int]:
@@ -143,5 +145,7 @@ def _wait_until_ready(client: httpx.Client, process: subprocess.Popen[bytes]) ->
 def send(files: list[Path] | Path, port: int, title: str = TITLE, caller: str = "SCENE") -> None:
     """Send files, or all files of a folder, with dcmtk's storescu."""
     what = ["+sd", str(files)] if isinstance(files, Path) else [str(file) for file in files]
-    command = [shutil.which("storescu") or "storescu", "-aec", title, "-aet", caller, "127.0.0.1", str(port)]
+    program = shutil.which("storescu", path=SYSTEM_PATH) or "storescu"
+    # By itself it proposes a fixed list of classes, in which segmentations are missing.
+    command = [program, "--required", "-aec", title, "-aet", caller, "127.0.0.1", str(port)]
     subprocess.run([*command, *what], check=True, capture_output=True)
