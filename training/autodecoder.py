@@ -20,22 +20,34 @@ Watch = Callable[[int, dict[str, float]], None]
 
 
 class AutoDecoder(nn.Module):
-    """Decoder, prior, and a Gaussian over each training shape's code (a point when the objective is the paper's)."""
+    """Decoder, prior, and a Gaussian over each training shape's code (a point when the objective is the paper's).
+
+    The Gaussians are held in units of the prior's sigmas. A dimension then shrinks as one, and a divergence that does not
+    depend on its sigma leaves the choice of that to the reconstruction and ARD.
+
+    Attributes:
+        pressure: factor on `ObjectiveConfig.lambda_flow`, from 0 to 1.
+    """
 
     def __init__(self, config: TrainingConfig, shapes: int) -> None:
         super().__init__()
         self.config = config
+        self.pressure = 1.0
         self.decoder = OccupancyDecoder(config.decoder)
         self.prior = LatentPrior(config.prior)
         size = config.decoder.latent_size
-        spread = config.prior.initial_sigma
-        self.mean = nn.Parameter(0.2 * spread * torch.randn(shapes, size))
-        self.log_deviation = nn.Parameter(torch.full((shapes, size), math.log(0.3 * spread)))
+        unit = 1.0 if self.variational else config.prior.initial_sigma
+        self.mean = nn.Parameter(0.2 * unit * torch.randn(shapes, size))
+        self.log_deviation = nn.Parameter(torch.full((shapes, size), math.log(0.3 * unit)))
 
     @property
     def variational(self) -> bool:
         """Whether codes are distributions."""
         return self.config.objective.name == "variational"
+
+    def code_means(self) -> Float[Tensor, "m d"]:
+        """Mean code of each training shape, or the code itself."""
+        return self.prior.sigma * self.mean if self.variational else self.mean
 
     def draw_codes(self, chosen: Int[Tensor, "b"], generator: torch.Generator) -> Float[Tensor, "b d"]:
         """A reparameterised draw of the chosen shapes' codes, or the codes themselves."""
@@ -43,7 +55,7 @@ class AutoDecoder(nn.Module):
         if not self.variational:
             return mean
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
-        return mean + self.log_deviation[chosen].exp() * noise
+        return self.prior.sigma * (mean + self.log_deviation[chosen].exp() * noise)
 
     def loss(self, chosen: Int[Tensor, "b"], batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         """The joint objective and its terms, means over the chosen shapes."""
@@ -54,9 +66,9 @@ class AutoDecoder(nn.Module):
         rec = reconstruction_loss(weights.reconstruction, logits.float(), batch.labels, batch.weights).mean()
         density = -self.prior.log_density(codes)
         if self.variational:
-            density = density - gaussian_entropy(self.log_deviation[chosen])
+            density = density - gaussian_entropy(self.log_deviation[chosen] + self.prior.log_sigma)
         ard = self.prior.ard_loss(weights.a, weights.b)
-        total = rec + weights.lambda_flow * density.mean()
+        total = rec + self.pressure * weights.lambda_flow * density.mean()
         if self.config.prior.use_ard:
             total = total + weights.lambda_ard * ard
         return {"loss": total, "reconstruction": rec, "prior": density.mean(), "ard": ard}
@@ -99,6 +111,8 @@ class Trainer:
 
     def _schedule(self) -> None:
         progress = self.step / self.config.steps
+        ramp = self.config.objective.ramp
+        self.module.pressure = min(1.0, progress / ramp) if ramp > 0 else 1.0
         rise = min(1.0, progress / self.config.warm_up) if self.config.warm_up > 0 else 1.0
         factor = rise * 0.5 * (1.0 + math.cos(math.pi * progress))
         for group in self.optimiser.param_groups:

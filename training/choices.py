@@ -48,6 +48,7 @@ def configured(
     *,
     flow: bool,
     ard: bool,
+    reflected: bool,
     seed: int,
     device: DeviceName,
 ) -> "TrainingConfig":
@@ -64,7 +65,7 @@ def configured(
     paper = objective is ObjectiveName.PAPER
     plain = TrainingConfig()
     prior = replace(PriorShape(FlowShape(latent_size=latent_size)), use_flow=flow, use_ard=ard, standardise=not paper)
-    loss = ObjectiveConfig(name="paper", reconstruction="dice") if paper else plain.objective
+    loss = ObjectiveConfig(name="paper", reconstruction="dice", ramp=0.0) if paper else plain.objective
     return replace(
         plain,
         decoder=DecoderShape(latent_size=latent_size, unit_columns=not paper),
@@ -72,6 +73,7 @@ def configured(
         objective=loss,
         regime=regime.value,
         batch_shapes=6 if paper else plain.batch_shapes,
+        reflected=reflected,
         seed=seed,
         device=resolved(device),
     )

@@ -55,6 +55,13 @@ def train(
     epochs: Annotated[int | None, typer.Option(min=1, help="Passes over the cohort, in place of --steps.")] = None,
     flow: Annotated[bool, typer.Option("--flow/--no-flow", help="Whether the prior has a flow.")] = True,
     ard: Annotated[bool, typer.Option("--ard/--no-ard", help="Whether relevance is determined.")] = True,
+    reflect: Annotated[
+        bool | None,
+        typer.Option(
+            "--reflect/--no-reflect",
+            help="Whether mirror images join the training shapes; for a public cohort yes where sides are mixed or none.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of validation persons, drawings and training.")] = 0,
     device: Annotated[DeviceName, typer.Option(help="Where to compute.")] = DeviceName.AUTO,
     output: Annotated[Path | None, typer.Option(help="Folder of the run.")] = None,
@@ -68,7 +75,11 @@ def train(
         options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
         found = open_cohort(cohort, masks, data, options, labels=tuple(label or ()))
         tell_findings(found)
-        config = configured(objective, regime, latent_size, flow=flow, ard=ard, seed=seed, device=device)
+        known = cohort is not None and found.reflects and objective is not ObjectiveName.PAPER
+        paired = known if reflect is None else reflect
+        config = configured(
+            objective, regime, latent_size, flow=flow, ard=ard, reflected=paired, seed=seed, device=device
+        )
         config = with_duration(config, steps, epochs, len(found.train))
         folder = output or Path("runs") / f"{found.name}-{regime}"
         figures = _train_with_progress(found, config, folder, resume=resume)

@@ -22,6 +22,7 @@ class ObjectiveConfig:
             density bounded.
         reconstruction: loss over sampled points and labels.
         lambda_flow: weight of the density or divergence term against the mean loss over points.
+        ramp: share of the steps over which `lambda_flow` rises from 0: dimensions find a use before they have to earn it.
         lambda_ard: weight of the Gamma prior on the precisions.
         a, b: shape and rate of that Gamma prior; a > 1, b < 1.
     """
@@ -29,6 +30,7 @@ class ObjectiveConfig:
     name: ObjectiveName = "variational"
     reconstruction: ReconstructionName = "bce"
     lambda_flow: float = 1e-3
+    ramp: float = 0.2
     lambda_ard: float = 5e-5
     a: float = 2.0
     b: float = 1e-4
@@ -43,6 +45,8 @@ class TrainingConfig:
             `far_points` elsewhere.
         learning_rate: of the networks; `code_learning_rate` of the latent codes. Both rise over `warm_up` (share of
             steps) and fall to zero along a cosine.
+        reflected: whether each training shape is joined by its mirror image (left and right exchanged), which belongs to
+            the population where sides are mixed or the structure is symmetric.
         flow_start: share of steps after which the flow is trained; it is the identity before.
     """
 
@@ -50,6 +54,7 @@ class TrainingConfig:
     prior: PriorShape = field(default_factory=lambda: PriorShape(FlowShape()))
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     regime: Regime = "dense"
+    reflected: bool = False
     steps: int = 8000
     batch_shapes: int = 32
     near_points: int = 192

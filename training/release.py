@@ -43,7 +43,7 @@ def export_run(
         ParityError: the exported graphs disagree with the networks.
     """
     config, record = read_record(run)
-    module = load_module(run, config, len(record["train"]))
+    module = load_module(run, config, record["codes"])
     if output.exists() and any(output.iterdir()):
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
     output.mkdir(parents=True, exist_ok=True)
@@ -112,11 +112,12 @@ def load_module(run: Path, config: TrainingConfig, shapes: int) -> AutoDecoder:
 def write_population(module: AutoDecoder, record: Mapping[str, Any], path: Path) -> None:
     """Codes, base codes, log densities (nats) and volumes (mL) of the training shapes."""
     with torch.no_grad():
-        base, _ = module.prior.to_base(module.mean)
-        density = module.prior.log_density(module.mean)
+        codes = module.code_means()
+        base, _ = module.prior.to_base(codes)
+        density = module.prior.log_density(codes)
     np.savez(
         path,
-        codes=_array(module.mean),
+        codes=_array(codes),
         base_codes=_array(base),
         log_densities=_array(density),
         volumes_ml=np.array(record["volumes_ml"], float),

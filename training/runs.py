@@ -41,6 +41,8 @@ def train_cohort(
         InvalidParameter: the folder holds a run and `resume` is off, or its run was made of something else.
     """
     shapes = cohort_points(cohort.train, config.regime, config.seed)
+    if config.reflected:
+        shapes += [shape.reflected() for shape in shapes]
     config = replace(config, decoder=replace(config.decoder, extent_mm=decoder_extent(shapes)))
     checkpoint = folder / CHECKPOINT
     _check_folder(folder, record(cohort, config), resume=resume)
@@ -56,6 +58,7 @@ def train_cohort(
 
 def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
     """What a run is made of, as plain values: configuration, cohort and the cases with the hashes of their masks."""
+    copies = 2 if config.reflected else 1
     return {
         "config": config.as_dict(),
         "cohort": cohort.name,
@@ -65,7 +68,8 @@ def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
         "attribution": cohort.attribution,
         "shippable": cohort.provenance.shippable,
         "train": {case.name: mask_digest(case) for case in cohort.train},
-        "volumes_ml": [float(case.mask.sum() * np.prod(case.grid.spacing) / 1000.0) for case in cohort.train],
+        "codes": copies * len(cohort.train),
+        "volumes_ml": copies * [float(case.mask.sum() * np.prod(case.grid.spacing) / 1000.0) for case in cohort.train],
         "half_extent_mm": half_extent(cohort),
         "validation": [case.name for case in cohort.validation],
         "refused": {refusal.name: refusal.reason for refusal in cohort.refused},

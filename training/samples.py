@@ -23,6 +23,10 @@ class ShapePoints:
     labels: Bool[np.ndarray, "n"]
     near: Bool[np.ndarray, "n"]
 
+    def reflected(self) -> "ShapePoints":
+        """The shape's mirror image: R is reversed."""
+        return ShapePoints(self.points * np.array([-1.0, 1.0, 1.0], np.float32), self.labels, self.near)
+
 
 @dataclass(frozen=True)
 class Batch:

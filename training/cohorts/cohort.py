@@ -85,6 +85,11 @@ class Cohort:
         return self.train + self.validation + self.test
 
     @property
+    def reflects(self) -> bool:
+        """Whether the mirror image of a case belongs to the population as well."""
+        return self.side in ("mixed", "unpaired")
+
+    @property
     def licence(self) -> str:
         """Licence of the masks."""
         return self.provenance.licence

@@ -207,3 +207,12 @@ class TestLearning:
             mean = module.decoder(torch.zeros(1, 4), torch.from_numpy(GRID.centres()).float()[None])[0]
         blind = [dice(shape.mask(GRID), (mean > 0).numpy().reshape(GRID.shape)) for shape in ellipsoids(3, seed=99)]
         assert np.mean(found) > np.mean(blind)
+
+
+def test_the_weight_of_the_prior_rises_along_the_ramp():
+    trainer = Trainer.start(replace(CONFIG, objective=ObjectiveConfig(ramp=0.5)), cohort())
+    found = []
+    for _ in range(CONFIG.steps):
+        trainer.advance()
+        found.append(trainer.module.pressure)
+    assert found == pytest.approx([min(1.0, step / (0.5 * CONFIG.steps)) for step in range(CONFIG.steps)])

@@ -119,7 +119,9 @@ class TestTrain:
 
 class TestConfiguration:
     def build(self, objective=ObjectiveName.VARIATIONAL, flow=True, ard=True):
-        return configured(objective, RegimeName.THICK, 16, flow=flow, ard=ard, seed=3, device=DeviceName.CPU)
+        return configured(
+            objective, RegimeName.THICK, 16, flow=flow, ard=ard, reflected=True, seed=3, device=DeviceName.CPU
+        )
 
     def test_options_reach_the_configuration(self):
         config = self.build(flow=False, ard=False)

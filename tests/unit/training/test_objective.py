@@ -146,7 +146,8 @@ class TestVariationalObjective:
         module, draws = module_of(config, shapes=2), 40_000
         with torch.no_grad():
             module.log_deviation.copy_(torch.tensor([[-1.0, 0.2, -0.4], [0.3, -2.0, 0.0]]))
-            posterior = torch.distributions.Normal(module.mean, module.log_deviation.exp())
+            sigma = module.prior.sigma
+            posterior = torch.distributions.Normal(sigma * module.mean, sigma * module.log_deviation.exp())
             prior = torch.distributions.Normal(torch.zeros(3), module.prior.sigma)
             expected = torch.distributions.kl_divergence(posterior, prior).sum(dim=1)
             for shape in range(2):
@@ -161,8 +162,22 @@ class TestVariationalObjective:
     def test_codes_are_drawn_from_their_gaussians(self):
         module = module_of(CONFIG)
         codes = module.draw_codes(torch.full((20_000,), 2), torch.Generator().manual_seed(0)).detach()
-        torch.testing.assert_close(codes.mean(dim=0), module.mean[2].detach(), atol=0.01, rtol=0)
-        torch.testing.assert_close(codes.std(dim=0), module.log_deviation[2].exp().detach(), atol=0.01, rtol=0)
+        deviation = (module.prior.sigma * module.log_deviation[2].exp()).detach()
+        torch.testing.assert_close(codes.mean(dim=0), module.code_means()[2].detach(), atol=0.01, rtol=0)
+        torch.testing.assert_close(codes.std(dim=0), deviation, atol=0.01, rtol=0)
+
+    def test_the_divergence_leaves_the_sigmas_alone(self):
+        module = module_of(CONFIG)
+        module.loss(torch.arange(5), batch_of(5), torch.Generator().manual_seed(0))["prior"].backward()
+        torch.testing.assert_close(module.prior.log_sigma.grad, torch.zeros(3), atol=1e-5, rtol=0)
+
+    def test_a_dimension_without_spread_moves_no_logit(self):
+        module, points = module_of(CONFIG), batch_of(1).points
+        with torch.no_grad():
+            module.prior.log_sigma[1] = -20.0
+            one, other = module.code_means()[:1], module.code_means()[:1].clone()
+            other[:, 1] = 0.0
+            torch.testing.assert_close(module.decoder(one, points), module.decoder(other, points))
 
     def test_every_part_learns(self):
         module = module_of(CONFIG)
@@ -180,6 +195,7 @@ class TestAblations:
         config = replace(CONFIG, objective=objective, prior=replace(CONFIG.prior, use_ard=False))
         module, terms = self.terms(config)
         expected = terms["reconstruction"] + objective.lambda_flow * terms["prior"]
+        assert module.pressure == 1.0
         torch.testing.assert_close(terms["loss"], expected)
         terms["loss"].backward()
         assert module.prior.log_sigma.grad is None

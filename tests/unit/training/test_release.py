@@ -74,10 +74,11 @@ class TestExport:
         manifest, output = released
         opened = open_bundle(output, threads=1)
         checkpoint = torch.load(run / "checkpoint.pt", weights_only=True)["module"]
-        np.testing.assert_allclose(opened.population.codes, checkpoint["mean"].numpy())
+        means = checkpoint["mean"] * checkpoint["prior.log_sigma"].exp()
+        np.testing.assert_allclose(opened.population.codes, means.numpy(), rtol=1e-6)
         np.testing.assert_allclose(manifest.sigmas, checkpoint["prior.log_sigma"].exp().numpy())
         gaussian = torch.distributions.Normal(torch.zeros(3), checkpoint["prior.log_sigma"].exp())
-        expected = gaussian.log_prob(checkpoint["mean"]).sum(dim=1).numpy()
+        expected = gaussian.log_prob(means).sum(dim=1).numpy()
         np.testing.assert_allclose(opened.population.log_densities, expected, rtol=1e-5)
         np.testing.assert_allclose(opened.prior.log_density(opened.population.codes)[0], expected, rtol=1e-4)
         np.testing.assert_array_equal(opened.population.base_codes, opened.population.codes)
@@ -86,7 +87,7 @@ class TestExport:
         points = np.random.default_rng(0).normal(scale=8.0, size=(4, 20, 3))
         with torch.no_grad():
             module = load_module(run, read_record(run)[0], 4)
-            logits = module.decoder(module.mean, torch.from_numpy(points).float()).numpy()
+            logits = module.decoder(module.code_means(), torch.from_numpy(points).float()).numpy()
         np.testing.assert_allclose(opened.decoder.logits(opened.population.codes, points), logits, atol=1e-3)
 
 

@@ -98,3 +98,16 @@ def test_the_half_extent_holds_every_shape():
 def test_active_dimensions_hold_their_share_of_the_variance(sigmas, expected):
     assert active_dimensions(np.array(sigmas)) == expected
     assert active_dimensions(np.array(sigmas)[::-1].copy()) == expected
+
+
+class TestReflection:
+    def test_mirror_images_join_the_shapes_and_the_record(self, tmp_path):
+        module = train_cohort(ellipsoids(3), replace(CONFIG, reflected=True, steps=2), tmp_path)
+        _, found = read_record(tmp_path)
+        assert len(module.mean) == found["codes"] == len(found["volumes_ml"]) == 6
+        assert found["volumes_ml"][:3] == found["volumes_ml"][3:]
+        assert len(found["train"]) == 3
+
+    def test_without_it_there_is_one_code_a_shape(self, tmp_path):
+        module = train_cohort(ellipsoids(3), replace(CONFIG, steps=2), tmp_path)
+        assert len(module.mean) == read_record(tmp_path)[1]["codes"] == 3

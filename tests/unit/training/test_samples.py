@@ -81,3 +81,12 @@ def test_a_shape_with_one_stratum_counts_by_its_mean(near, far):
     pool = PointPool([shape_of(0, 9, 9), shape_of(1, near, far)], CPU)
     batch = pool.draw(torch.tensor([1]), (8, 4), generator())
     assert batch.weights.sum().item() == pytest.approx(1.0)
+
+
+def test_a_mirror_image_has_left_and_right_exchanged_and_undoes_itself():
+    shape = shape_of(3, 5, 4)
+    image = shape.reflected()
+    np.testing.assert_array_equal(image.points, shape.points * [-1, 1, 1])
+    np.testing.assert_array_equal(image.labels, shape.labels)
+    np.testing.assert_array_equal(image.near, shape.near)
+    np.testing.assert_array_equal(image.reflected().points, shape.points)
