@@ -22,11 +22,11 @@ Watch = Callable[[int, dict[str, float]], None]
 class AutoDecoder(nn.Module):
     """Decoder, prior, and a Gaussian over each training shape's code (a point when the objective is the paper's).
 
-    The Gaussians are held in units of the prior's sigmas. A dimension then shrinks as one, and a divergence that does not
-    depend on its sigma leaves the choice of that to the reconstruction and ARD.
+    The Gaussians are held in units of the prior's sigmas. A dimension then shrinks as one, and the divergence, which
+    does not depend on its sigma, leaves the choice of that to the reconstruction and ARD.
 
     Attributes:
-        pressure: factor on `ObjectiveConfig.lambda_flow`, from 0 to 1.
+        pressure: factor on `lambda_flow` and `lambda_ard` of the objective, from 0 to 1.
     """
 
     def __init__(self, config: TrainingConfig, shapes: int) -> None:
@@ -70,7 +70,7 @@ class AutoDecoder(nn.Module):
         ard = self.prior.ard_loss(weights.a, weights.b)
         total = rec + self.pressure * weights.lambda_flow * density.mean()
         if self.config.prior.use_ard:
-            total = total + weights.lambda_ard * ard
+            total = total + self.pressure * weights.lambda_ard * ard
         return {"loss": total, "reconstruction": rec, "prior": density.mean(), "ard": ard}
 
 

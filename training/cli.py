@@ -59,7 +59,7 @@ def train(
         bool | None,
         typer.Option(
             "--reflect/--no-reflect",
-            help="Whether mirror images join the training shapes; for a public cohort yes where sides are mixed or none.",
+            help="Whether mirror images join the training shapes; of public cohorts without a side they do.",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of validation persons, drawings and training.")] = 0,

@@ -22,7 +22,7 @@ class ObjectiveConfig:
             density bounded.
         reconstruction: loss over sampled points and labels.
         lambda_flow: weight of the density or divergence term against the mean loss over points.
-        ramp: share of the steps over which `lambda_flow` rises from 0: dimensions find a use before they have to earn it.
+        ramp: share of the steps over which `lambda_flow` and `lambda_ard` rise from 0: dimensions find a use first.
         lambda_ard: weight of the Gamma prior on the precisions.
         a, b: shape and rate of that Gamma prior; a > 1, b < 1.
     """
@@ -45,8 +45,8 @@ class TrainingConfig:
             `far_points` elsewhere.
         learning_rate: of the networks; `code_learning_rate` of the latent codes. Both rise over `warm_up` (share of
             steps) and fall to zero along a cosine.
-        reflected: whether each training shape is joined by its mirror image (left and right exchanged), which belongs to
-            the population where sides are mixed or the structure is symmetric.
+        reflected: whether each training shape is joined by its mirror image (left and right exchanged), which belongs
+            to the population where sides are mixed or the structure is symmetric.
         flow_start: share of steps after which the flow is trained; it is the identity before.
     """
 
