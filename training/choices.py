@@ -9,6 +9,11 @@ from model.errors import InvalidParameter
 if TYPE_CHECKING:
     from training.config import TrainingConfig
 
+#: One shape in so many is drawn in a step, within a range.
+BATCH_SHARE, BATCH_RANGE = 4, (32, 128)
+#: Points of a step, and at most of a shape; three quarters of them near its contour.
+STEP_POINTS, MOST_POINTS = 8192, 256
+
 
 class RegimeName(StrEnum):
     """How sparse the drawings are."""
@@ -91,6 +96,18 @@ def resolved(device: DeviceName) -> str:
     if device is DeviceName.CUDA and not there:
         raise InvalidParameter("No CUDA device is there; cpu or auto is accepted.", part="device")
     return "cuda" if there and device is not DeviceName.CPU else "cpu"
+
+
+def with_batches(config: "TrainingConfig", shapes: int) -> "TrainingConfig":
+    """The configuration with batches for a cohort of so many codes; the paper's are left as they are.
+
+    A code learns only when its shape is drawn, so that large cohorts want many shapes a step and fewer points of each.
+    """
+    if config.objective.name == "paper":
+        return config
+    batch = min(max(shapes // BATCH_SHARE, BATCH_RANGE[0]), BATCH_RANGE[1])
+    points = min(MOST_POINTS, STEP_POINTS // batch)
+    return replace(config, batch_shapes=batch, near_points=3 * points // 4, far_points=points // 4)
 
 
 def with_duration(config: "TrainingConfig", steps: int | None, epochs: int | None, shapes: int) -> "TrainingConfig":

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from model.errors import InvalidParameter
-from training.choices import DeviceName, ObjectiveName, RegimeName, SplitName, configured, with_duration
+from training.choices import DeviceName, ObjectiveName, RegimeName, SplitName, configured, with_batches, with_duration
 from training.cohorts import Cohort, CohortName, CohortOptions
 from training.console import exit_status, finding_counts, open_cohort, progress, tell_findings
 
@@ -80,7 +80,8 @@ def train(
         config = configured(
             objective, regime, latent_size, flow=flow, ard=ard, reflected=paired, seed=seed, device=device
         )
-        config = with_duration(config, steps, epochs, len(found.train))
+        codes = (2 if paired else 1) * len(found.train)
+        config = with_duration(with_batches(config, codes), steps, epochs, codes)
         folder = output or Path("runs") / f"{found.name}-{regime}"
         figures = _train_with_progress(found, config, folder, resume=resume)
         _print_run(found, config, folder, figures, as_json=as_json)

@@ -30,10 +30,10 @@ class ObjectiveConfig:
     name: ObjectiveName = "variational"
     reconstruction: ReconstructionName = "bce"
     lambda_flow: float = 1e-3
-    ramp: float = 0.2
-    lambda_ard: float = 5e-5
+    ramp: float = 0.3
+    lambda_ard: float = 1e-4
     a: float = 2.0
-    b: float = 1e-4
+    b: float = 1e-6
 
 
 @dataclass(frozen=True)

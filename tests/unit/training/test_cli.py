@@ -8,7 +8,7 @@ import typer
 from typer.testing import CliRunner
 
 from model.bundle import open_bundle
-from training.choices import DeviceName, ObjectiveName, RegimeName, configured, with_duration
+from training.choices import DeviceName, ObjectiveName, RegimeName, configured, with_batches, with_duration
 from training.cli import register
 from training.config import TrainingConfig
 
@@ -136,6 +136,16 @@ class TestConfiguration:
         assert config.batch_shapes == 6
         assert not config.prior.standardise
         assert not config.decoder.unit_columns
+
+    @pytest.mark.parametrize(("shapes", "batch", "points"), [(15, 32, 256), (286, 71, 115), (5000, 128, 64)])
+    def test_large_cohorts_have_more_shapes_and_fewer_points_in_a_step(self, shapes, batch, points):
+        config = with_batches(TrainingConfig(), shapes)
+        assert config.batch_shapes == batch
+        assert points - 2 <= config.near_points + config.far_points <= points
+
+    def test_the_papers_batches_stay(self):
+        config = self.build(ObjectiveName.PAPER)
+        assert with_batches(config, 5000) == config
 
     @pytest.mark.parametrize(("shapes", "batch", "steps"), [(12, 6, 30), (13, 6, 45), (4, 6, 15)])
     def test_an_epoch_sees_every_shape(self, shapes, batch, steps):
