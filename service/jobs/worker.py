@@ -22,6 +22,7 @@ from service.errors import Overloaded
 from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobKind
 from service.jobs.kinds import all_kinds
+from service.jobs.priority import stand_back
 from service.jobs.tools import JobTools
 from service.model_registry import ModelRegistry
 from service.observability import Log, make_log
@@ -63,7 +64,7 @@ def run_worker(settings: Settings, registry: ModelRegistry, slot: int, *, attach
         signal.signal(number, lambda *_: stop.set())
     if attached:
         threading.Thread(target=_stop_with_input, args=(stop,), daemon=True).start()
-    os.nice(settings.job_nice)
+    stand_back(settings.job_nice)
     log = make_log(settings.log_level)
     tools = make_tools(settings, registry, log)
     jobs = open_jobs(settings)
