@@ -15,6 +15,8 @@ from training.config import TrainingConfig
 from training.objective import gaussian_entropy, reconstruction_loss
 from training.samples import Batch, PointPool, ShapePoints
 
+#: Standard deviation of the codes' noise with the denoising objective.
+NOISE = 0.1
 #: Called after each step with the step's number and its figures.
 Watch = Callable[[int, dict[str, float]], None]
 
@@ -22,8 +24,8 @@ Watch = Callable[[int, dict[str, float]], None]
 class AutoDecoder(nn.Module):
     """Decoder, prior, and a Gaussian over each training shape's code (a point when the objective is the paper's).
 
-    The Gaussians are held in units of the prior's sigmas. A dimension then shrinks as one, and the divergence, which
-    does not depend on its sigma, leaves the choice of that to the reconstruction and ARD.
+    With the default objective the Gaussians are held in units of the prior's sigmas. A dimension then shrinks as one,
+    and the divergence, which does not depend on its sigma, leaves the choice of that to the reconstruction and ARD.
 
     Attributes:
         pressure: factor on `lambda_flow` and `lambda_ard` of the objective, from 0 to 1.
@@ -36,26 +38,38 @@ class AutoDecoder(nn.Module):
         self.decoder = OccupancyDecoder(config.decoder)
         self.prior = LatentPrior(config.prior)
         size = config.decoder.latent_size
-        unit = 1.0 if self.variational else config.prior.initial_sigma
+        unit = 1.0 if self.in_sigmas else config.prior.initial_sigma
         self.mean = nn.Parameter(0.2 * unit * torch.randn(shapes, size))
-        self.log_deviation = nn.Parameter(torch.full((shapes, size), math.log(0.3 * unit)))
+        learned = config.objective.name != "denoising"
+        start = 0.3 * unit if learned else NOISE
+        self.log_deviation = nn.Parameter(torch.full((shapes, size), math.log(start)), requires_grad=learned)
 
     @property
-    def variational(self) -> bool:
+    def random(self) -> bool:
         """Whether codes are distributions."""
+        return self.config.objective.name != "paper"
+
+    @property
+    def in_sigmas(self) -> bool:
+        """Whether codes are held in units of the prior's sigmas."""
         return self.config.objective.name == "variational"
 
     def code_means(self) -> Float[Tensor, "m d"]:
         """Mean code of each training shape, or the code itself."""
-        return self.prior.sigma * self.mean if self.variational else self.mean
+        return self.prior.sigma * self.mean if self.in_sigmas else self.mean
+
+    def log_deviations(self, chosen: Int[Tensor, "b"]) -> Float[Tensor, "b d"]:
+        """Logarithms of the standard deviations of the chosen shapes' codes."""
+        own = self.log_deviation[chosen]
+        return own + self.prior.log_sigma if self.in_sigmas else own
 
     def draw_codes(self, chosen: Int[Tensor, "b"], generator: torch.Generator) -> Float[Tensor, "b d"]:
         """A reparameterised draw of the chosen shapes' codes, or the codes themselves."""
-        mean = self.mean[chosen]
-        if not self.variational:
+        mean = self.code_means()[chosen]
+        if not self.random:
             return mean
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
-        return self.prior.sigma * (mean + self.log_deviation[chosen].exp() * noise)
+        return mean + self.log_deviations(chosen).exp() * noise
 
     def loss(self, chosen: Int[Tensor, "b"], batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         """The joint objective and its terms, means over the chosen shapes."""
@@ -65,8 +79,8 @@ class AutoDecoder(nn.Module):
             logits = self.decoder(codes, batch.points)
         rec = reconstruction_loss(weights.reconstruction, logits.float(), batch.labels, batch.weights).mean()
         density = -self.prior.log_density(codes)
-        if self.variational:
-            density = density - gaussian_entropy(self.log_deviation[chosen] + self.prior.log_sigma)
+        if self.random:
+            density = density - gaussian_entropy(self.log_deviations(chosen))
         ard = self.prior.ard_loss(weights.a, weights.b)
         total = rec + self.pressure * weights.lambda_flow * density.mean()
         if self.config.prior.use_ard:
@@ -142,7 +156,7 @@ class Trainer:
 
 
 def _optimiser(module: AutoDecoder, config: TrainingConfig) -> torch.optim.Optimizer:
-    codes = [module.mean, module.log_deviation]
+    codes = [parameter for parameter in (module.mean, module.log_deviation) if parameter.requires_grad]
     groups = [
         ("decoder", list(module.decoder.parameters()), config.learning_rate, config.weight_decay),
         ("flow", list(module.prior.flow.parameters()), config.flow_learning_rate, config.weight_decay),

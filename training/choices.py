@@ -35,6 +35,8 @@ class ObjectiveName(StrEnum):
     """Which objective is minimised."""
 
     PAPER = "paper"
+    DENOISING = "denoising"
+    CENTRED = "centred"
     VARIATIONAL = "variational"
 
 
@@ -70,7 +72,11 @@ def configured(
     paper = objective is ObjectiveName.PAPER
     plain = TrainingConfig()
     prior = replace(PriorShape(FlowShape(latent_size=latent_size)), use_flow=flow, use_ard=ard, standardise=not paper)
-    loss = ObjectiveConfig(name="paper", reconstruction="dice", ramp=0.0) if paper else plain.objective
+    loss = (
+        ObjectiveConfig(name="paper", reconstruction="dice", ramp=0.0)
+        if paper
+        else replace(plain.objective, name=objective.value)
+    )
     return replace(
         plain,
         decoder=DecoderShape(latent_size=latent_size, unit_columns=not paper),

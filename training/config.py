@@ -8,7 +8,7 @@ from model.networks.flow import FlowShape
 from model.networks.prior import PriorShape
 
 Regime = Literal["thin", "thick", "orthogonal", "dense"]
-ObjectiveName = Literal["paper", "variational"]
+ObjectiveName = Literal["paper", "denoising", "centred", "variational"]
 ReconstructionName = Literal["dice", "bce", "bce_dice"]
 
 
@@ -17,9 +17,10 @@ class ObjectiveConfig:
     """Weights of the joint objective.
 
     Attributes:
-        name: ``paper`` treats codes as points and adds the negative log prior density; ``variational`` treats each
-            code as a diagonal Gaussian and adds the Kullback-Leibler divergence to the prior, which keeps the
-            density bounded.
+        name: ``paper`` treats codes as points and adds the negative log prior density. The others keep that bounded:
+            ``denoising`` blurs the points by a fixed noise; ``centred`` treats each code as a diagonal Gaussian and
+            adds the Kullback-Leibler divergence to the prior; ``variational`` does so with the Gaussians in units of
+            the prior's sigmas.
         reconstruction: loss over sampled points and labels.
         lambda_flow: weight of the density or divergence term against the mean loss over points.
         ramp: share of the steps over which `lambda_flow` and `lambda_ard` rise from 0: dimensions find a use first.

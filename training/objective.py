@@ -2,9 +2,10 @@
 
     L = L_rec + lambda_flow * L_prior + lambda_ARD * L_ARD
 
-`paper`: L_prior = -log p(z) at the code. `variational`: the code is q(z) = N(mu, diag(s^2)) and
+`paper`: L_prior = -log p(z) at the code. The others: the code is q(z) = N(mu, diag(s^2)) and
 L_prior = E_q[log q(z) - log p(z)], one reparameterised draw a step. Free codes and a flexible flow make the first
-unbounded below; the entropy of q bounds the second.
+unbounded below; the entropy of q bounds the second. `denoising` holds s fixed, `centred` learns mu and s, `variational`
+learns mu / sigma and s / sigma (the non-centred form of Papaspiliopoulos et al. 2007).
 """
 
 import math

@@ -47,7 +47,7 @@ def advanced(config: TrainingConfig, steps: int) -> Trainer:
 
 
 class TestRepeatability:
-    @pytest.mark.parametrize("objective", [PAPER, ObjectiveConfig()])
+    @pytest.mark.parametrize("objective", [PAPER, ObjectiveConfig(), ObjectiveConfig(name="denoising")])
     def test_one_seed_gives_one_model_and_another_seed_another(self, objective):
         config = replace(CONFIG, objective=objective)
         one, again, other = (weights(advanced(replace(config, seed=seed), 6)) for seed in (0, 0, 1))
@@ -62,7 +62,7 @@ class TestRepeatability:
             trainer.advance()
         assert same(expected, weights(trainer))
 
-    @pytest.mark.parametrize("objective", [PAPER, ObjectiveConfig()])
+    @pytest.mark.parametrize("objective", [PAPER, ObjectiveConfig(), ObjectiveConfig(name="denoising")])
     @pytest.mark.parametrize("stop", [1, 8])
     def test_a_checkpoint_continues_bit_for_bit(self, objective, stop, tmp_path):
         config = replace(CONFIG, objective=objective)

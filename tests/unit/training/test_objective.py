@@ -23,6 +23,7 @@ CONFIG = TrainingConfig(
     prior=PriorShape(FlowShape(latent_size=3, transforms=2, bins=3, width=6)),
 )
 PAPER = ObjectiveConfig(name="paper", reconstruction="dice", lambda_flow=0.02, lambda_ard=0.003, a=1.7, b=0.4)
+OBJECTIVES = [PAPER, *(ObjectiveConfig(name=name) for name in ("denoising", "centred", "variational"))]
 
 
 def module_of(config: TrainingConfig, shapes: int = 5) -> AutoDecoder:
@@ -159,10 +160,12 @@ class TestVariationalObjective:
                 assert abs(found.item() - expected[shape].item()) < 4 * error
                 assert error < 0.05 * expected[shape].item()
 
-    def test_codes_are_drawn_from_their_gaussians(self):
-        module = module_of(CONFIG)
+    @pytest.mark.parametrize("objective", OBJECTIVES[1:])
+    def test_codes_are_drawn_from_their_gaussians(self, objective):
+        module = module_of(replace(CONFIG, objective=objective))
         codes = module.draw_codes(torch.full((20_000,), 2), torch.Generator().manual_seed(0)).detach()
-        deviation = (module.prior.sigma * module.log_deviation[2].exp()).detach()
+        unit = module.prior.sigma if objective.name == "variational" else torch.ones(3)
+        deviation = (unit * module.log_deviation[2].exp()).detach()
         torch.testing.assert_close(codes.mean(dim=0), module.code_means()[2].detach(), atol=0.01, rtol=0)
         torch.testing.assert_close(codes.std(dim=0), deviation, atol=0.01, rtol=0)
 
@@ -179,10 +182,12 @@ class TestVariationalObjective:
             other[:, 1] = 0.0
             torch.testing.assert_close(module.decoder(one, points), module.decoder(other, points))
 
-    def test_every_part_learns(self):
-        module = module_of(CONFIG)
+    @pytest.mark.parametrize("objective", OBJECTIVES[1:])
+    def test_every_part_learns(self, objective):
+        module = module_of(replace(CONFIG, objective=objective))
         module.loss(torch.arange(5), batch_of(5), torch.Generator())["loss"].backward()
-        assert all(parameter.grad is not None for parameter in module.parameters())
+        still = {name for name, parameter in module.named_parameters() if parameter.grad is None}
+        assert still == ({"log_deviation"} if objective.name == "denoising" else set())
 
 
 class TestAblations:
@@ -190,7 +195,7 @@ class TestAblations:
         module = module_of(config)
         return module, module.loss(torch.arange(5), batch_of(5), torch.Generator().manual_seed(0))
 
-    @pytest.mark.parametrize("objective", [PAPER, ObjectiveConfig()])
+    @pytest.mark.parametrize("objective", OBJECTIVES)
     def test_without_ard_the_gamma_prior_is_left_out_and_sigma_stays(self, objective):
         config = replace(CONFIG, objective=objective, prior=replace(CONFIG.prior, use_ard=False))
         module, terms = self.terms(config)
@@ -212,7 +217,7 @@ class TestAblations:
         _, terms = self.terms(config)
         assert torch.equal(terms["loss"], terms["reconstruction"])
 
-    @pytest.mark.parametrize("objective", [PAPER, ObjectiveConfig()])
+    @pytest.mark.parametrize("objective", OBJECTIVES)
     def test_a_configuration_survives_being_written_down(self, objective):
         config = replace(CONFIG, objective=objective, prior=replace(CONFIG.prior, use_flow=False, use_ard=False))
         assert config_from_dict(config.as_dict()) == config
