@@ -8,7 +8,7 @@ LOCKS := pyproject.toml constraints.txt
 EXAMPLE := docs/examples/hippocampus_three_slices.nii.gz
 
 .DEFAULT_GOAL := help
-.PHONY: help setup serve test lint format demo pacs bench lock wheel clean
+.PHONY: help setup serve test lint format page demo pacs bench lock wheel clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -57,6 +57,10 @@ bench: $(VENV)/.development  ## time and accuracy on this machine
 format: $(VENV)/.development  ## put the code into shape
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+page:  ## build the page that the service serves from its sources (Node 20 or later with npm)
+	rm -rf build/page/src && mkdir -p build/page && cp -R service/page/source/. build/page
+	cd build/page && npm ci --no-audit --no-fund && npm run build -- --outDir $(CURDIR)/service/page/built
 
 wheel: $(VENV)/.development  ## build/dist/*.whl
 	$(BIN)/python -m build --wheel --outdir build/dist

@@ -19,11 +19,14 @@ from service.adapters.workers import WorkerPool
 from service.model_registry import ModelRegistry, load_registry
 from service.observability import Log, Metrics, make_log
 from service.ports import MaskReader
+from service.routes.comparisons import comparisons_router
 from service.routes.dependencies import Services
 from service.routes.jobs import jobs_router
 from service.routes.middleware import AccessMiddleware, BodyLimitMiddleware, KeyMiddleware
 from service.routes.models import models_router
 from service.routes.operations import operations_router
+from service.routes.page import page_router
+from service.routes.planes import planes_router
 from service.routes.problems import install_handlers
 from service.routes.reconstructions import reconstructions_router
 from service.routes.results import results_router
@@ -129,11 +132,14 @@ def _add_routes(app: FastAPI) -> None:
     for router in (
         reconstructions_router,
         results_router,
+        comparisons_router,
+        planes_router,
         models_router,
         samples_router,
         jobs_router,
         stow_router,
         operations_router,
+        page_router,
     ):
         app.include_router(router())
     app.openapi = partial(describe, app)  # type: ignore[method-assign]

@@ -1,13 +1,19 @@
 """Domain types to wire types: what a client reads of an outcome and of a model."""
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool
 
 from model.bundle import ShapeModel
-from model.inference.observations import Plane
+from model.inference.mask_stack import MaskStack, Plane, section_of
 from model.inference.uncertainty import Estimate
 from service.ports import Outcome, StoredResult
 from service.schemas import (
     ActiveDimensions,
+    DrawnPlanes,
+    DrawnPlaneSchema,
     EstimateSchema,
     FitSchema,
     Links,
@@ -18,6 +24,7 @@ from service.schemas import (
     PoseSchema,
     ResidualSchema,
     ResultSummary,
+    StackSchema,
     Summary,
     SurfaceSdSummary,
 )
@@ -81,6 +88,22 @@ def result_summary(result: StoredResult, address: str) -> ResultSummary:
     )
 
 
+def drawn_planes(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> DrawnPlanes:
+    """The wire form of annotated planes."""
+    return DrawnPlanes(
+        stacks=[
+            StackSchema(part=stack.part, shape=list(stack.grid.shape), affine=stack.grid.affine.tolist())
+            for stack in stacks
+        ],
+        planes=[
+            DrawnPlaneSchema(
+                **_plane(plane).model_dump(), runs=_runs(section_of(stacks[plane.stack].foreground, plane))
+            )
+            for plane in planes
+        ],
+    )
+
+
 def model_summary(model: ShapeModel, address: str) -> ModelSummary:
     """The wire form of a model in short."""
     manifest = model.manifest
@@ -113,6 +136,12 @@ def model_description(model: ShapeModel, address: str) -> ModelDescription:
         attribution=manifest.attribution,
         accuracy=manifest.accuracy,
     )
+
+
+def _runs(section: Bool[np.ndarray, "a b"]) -> list[list[int]]:
+    """Foreground of a plane as [start, length] of its voxels by rows."""
+    change = np.flatnonzero(np.diff(section.ravel(), prepend=False, append=False))
+    return [[int(start), int(end - start)] for start, end in zip(change[::2], change[1::2], strict=True)]
 
 
 def _plane(plane: Plane) -> PlaneSchema:

@@ -58,6 +58,21 @@ class ReconstructionForm(_Closed):
         return Options(annotated, self.uncertainty, self.mirror, self.resolution_mm, self.seed, self.fidelity)
 
 
+class PlanesForm(_Closed):
+    """The parts of a request for annotated planes."""
+
+    mask: list[UploadFile] = Field(min_length=1, description="as of a reconstruction")
+    label: list[str] = Field(default_factory=list, description="as of a reconstruction")
+    annotated: str = Field("auto", description="as of a reconstruction")
+
+
+class ComparisonQuery(_Closed):
+    """Query of a comparison."""
+
+    other: str = Field(description="identifier of the result that is compared with")
+    format: Literal["ply", "glb", "vtp", "mz3"] = Field("ply", description="file format")
+
+
 class MeshQuery(_Closed):
     """Query of a mesh."""
 
@@ -104,6 +119,31 @@ class PlaneSchema(_Closed):
     stack: int = Field(ge=0, description="number of the mask part")
     axis: int = Field(ge=0, le=2, description="voxel axis that the plane is perpendicular to")
     index: int = Field(ge=0, description="voxel index along the axis")
+
+
+class StackSchema(BaseModel):
+    """The voxels of one mask."""
+
+    part: str = Field(description="the part that it came in")
+    shape: list[int] = Field(description="voxels along i, j and k")
+    affine: list[list[float]] = Field(description="4 x 4, by rows: voxel index to RAS mm")
+
+
+class DrawnPlaneSchema(PlaneSchema):
+    """An annotated plane and what is drawn on it."""
+
+    runs: list[list[int]] = Field(
+        description="foreground as [start, length] in the plane's voxels by rows, in-plane axes in ascending order"
+    )
+
+
+class DrawnPlanes(BaseModel):
+    """What a reconstruction reads of masks; coordinates are RAS in mm."""
+
+    space: Literal["RAS"] = "RAS"
+    unit: Literal["mm"] = "mm"
+    stacks: list[StackSchema]
+    planes: list[DrawnPlaneSchema]
 
 
 class EstimateSchema(BaseModel):

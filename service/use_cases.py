@@ -1,6 +1,6 @@
 """What the service can do, as plain functions of domain types: no HTTP, no settings, no clock."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +9,10 @@ from jaxtyping import Float, Float32, UInt8
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter, TooLarge, UnknownModel
 from model.geometry import Grid, Pose
+from model.inference.comparison import compared
 from model.inference.fitting import Fit, FitStatus
-from model.inference.observations import MaskStack
+from model.inference.mesh import Mesh
+from model.inference.observations import AnnotatedRule, MaskStack, Plane, find_planes
 from model.inference.reconstruction import Options, Watch
 from model.inference.reconstruction import reconstruct as infer
 from model.inference.sampling import SampledShape, draw_shape
@@ -82,6 +84,16 @@ def surface_sd(outcome: Outcome) -> Float[np.ndarray, "v"]:
     """Standard deviation (mm) of the surface at each vertex; `NotComputed` without uncertainty."""
     _require_uncertainty(outcome)
     return outcome.reconstruction.mesh.scalars[SURFACE_SD]
+
+
+def annotated_planes(stacks: tuple[MaskStack, ...], rule: AnnotatedRule | Sequence[Plane]) -> tuple[Plane, ...]:
+    """The planes that `reconstruct` would use; errors as there."""
+    return find_planes(stacks, rule)
+
+
+def compare(outcome: Outcome, other: Outcome) -> Mesh:
+    """Surface of an outcome with its signed distance (mm) to another's, both in the world of their inputs."""
+    return compared(outcome.reconstruction.mesh, other.reconstruction.mesh)
 
 
 def draw(model: ShapeModel, seed: int, temperature: float, spacing_mm: float | None, max_voxels: int) -> SampledShape:

@@ -15,9 +15,9 @@ from service.observability import Log, Metrics
 from service.routes.problems import internal_error, respond_to
 
 _SAFE_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}\Z")
-#: Open without a key: probes, and the description of the interface.
-OPEN_PATHS = ("/healthz", "/readyz", "/docs", "/redoc", "/openapi.json")
-OPEN_PREFIX = "/static-offline-docs/"
+#: Open without a key: probes, the page, which asks for one, and the description of the interface.
+OPEN_PATHS = ("/", "/healthz", "/readyz", "/docs", "/redoc", "/openapi.json")
+OPEN_PREFIXES = ("/static-offline-docs/", "/page/")
 
 
 class AccessMiddleware:
@@ -150,7 +150,7 @@ def _request_id(given: str | None) -> str:
 
 def _is_open(scope: Scope) -> bool:
     path = scope["path"].removeprefix(scope.get("root_path", ""))
-    return path in OPEN_PATHS or path.startswith(OPEN_PREFIX)
+    return path in OPEN_PATHS or path.startswith(OPEN_PREFIXES)
 
 
 def _route(scope: Scope) -> str:

@@ -19,6 +19,9 @@ from packaging.version import Version
 #: Extras that a package may import from, beside the core.
 EXTRAS = {"model": ("torch", "training"), "service": ("torch", "pacs", "demo", "cluster"), "training": ("training",)}
 
+#: What the page is built from does not ship.
+PAGE_SOURCES = Path("service", "page", "source")
+
 
 @pytest.fixture(scope="module")
 def project(repository: Path) -> dict[str, Any]:
@@ -87,7 +90,7 @@ def test_wheel_holds_code_models_and_licence(tmp_path: Path, repository: Path) -
         str(path.relative_to(repository))
         for folder in EXTRAS
         for path in (repository / folder).rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
+        if path.is_file() and "__pycache__" not in path.parts and not path.is_relative_to(repository / PAGE_SOURCES)
     }
     assert expected <= names
     assert {name.partition("/")[0] for name in names} - set(EXTRAS) == {wheel.name.rsplit("-py3", 1)[0] + ".dist-info"}

@@ -1,0 +1,85 @@
+/** Two results beside each other, each coloured by how far it lies outside (or inside) the other. */
+
+import { type Api, resultPath } from '../api'
+import { legend, scaleAroundZero } from '../colour'
+import { button, field, h, option, replace, unique } from '../dom'
+import { type Surface, readMz3 } from '../mesh'
+import { knownResults } from '../results'
+import { T } from '../text'
+import { PLAIN_LOOK, SurfaceView } from '../viewer'
+
+export class Compare {
+  readonly element = h('section', { class: 'card compare' })
+  private readonly first = choice()
+  private readonly second = choice()
+  private readonly views = [new SurfaceView(T.compare.first), new SurfaceView(T.compare.second)] as const
+  private readonly pair = h('div', { class: 'pair', hidden: true })
+  private readonly legendPlace = h('div', { class: 'legend-place still' })
+  private readonly told = h('p', { class: 'finding', role: 'status' })
+  private linked = false
+
+  constructor(
+    private readonly api: Api,
+    private readonly fail: (fault: unknown) => void,
+  ) {
+    const run = button(T.compare.run, () => void this.run(), { class: 'primary' })
+    const controls = h('div', { class: 'row' }, field(T.compare.first, this.first.element), field(T.compare.second, this.second.element), run)
+    replace(this.pair, ...this.views.map((view, n) => h('figure', {}, view.element, h('figcaption', {}, n === 0 ? T.compare.first : T.compare.second))))
+    replace(this.element, h('h2', {}, T.compare.title), h('p', { class: 'hint' }, T.compare.how), controls, this.told, this.legendPlace, this.pair)
+    this.refresh()
+  }
+
+  refresh(): void {
+    const known = knownResults()
+    for (const one of [this.first, this.second]) {
+      replace(one.list, ...known.map((result) => option(result.id, result.label)))
+    }
+    const [latest, before] = known
+    if (latest && !this.first.element.value) this.first.element.value = latest.id
+    if (before && !this.second.element.value) this.second.element.value = before.id
+  }
+
+  private async run(): Promise<void> {
+    const [a, b] = [identifier(this.first.element.value), identifier(this.second.element.value)]
+    if (!a || !b) {
+      this.told.textContent = T.compare.needTwo
+      return
+    }
+    try {
+      this.told.textContent = T.compare.working
+      const surfaces = await Promise.all([this.fetch(a, b), this.fetch(b, a)])
+      await this.show(surfaces)
+    } catch (fault) {
+      this.told.textContent = ''
+      this.fail(fault)
+    }
+  }
+
+  private async show(surfaces: [Surface, Surface]): Promise<void> {
+    const both = new Float32Array(surfaces.flatMap((surface) => [...surface.scalars!]))
+    const scale = scaleAroundZero(both)
+    this.pair.hidden = false
+    for (const n of [0, 1] as const) await this.views[n].show(surfaces[n], { ...PLAIN_LOOK, scale })
+    if (!this.linked) this.views[0].link(this.views[1])
+    this.linked = true
+    replace(this.legendPlace, legend(scale, T.compare.legend, 'mm'))
+    const mean = both.reduce((sum, value) => sum + Math.abs(value), 0) / both.length
+    this.told.textContent = T.compare.finding(mean, both.reduce((a, b) => Math.max(a, Math.abs(b)), 0))
+  }
+
+  private async fetch(id: string, other: string): Promise<Surface> {
+    return readMz3(await this.api.bytes(resultPath(id, `/comparison?other=${encodeURIComponent(other)}&format=mz3`)))
+  }
+}
+
+function choice(): { element: HTMLInputElement; list: HTMLDataListElement } {
+  const list = h('datalist', { id: unique('known') })
+  const element = h('input', { type: 'text', list: list.id, placeholder: T.compare.placeholder, spellcheck: 'false' })
+  document.body.append(list)
+  return { element, list }
+}
+
+/** The identifier in a link or on its own. */
+function identifier(text: string): string {
+  return decodeURIComponent(text.trim().replace(/^.*\/result\//, ''))
+}

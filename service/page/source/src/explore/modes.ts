@@ -1,0 +1,110 @@
+/** The mean shape, moved along the model's leading modes by sliders while they are dragged. */
+
+import { type Api, isAbort } from '../api'
+import { type Scale, legend, scaleAroundZero } from '../colour'
+import { button, h, replace } from '../dom'
+import { slider } from '../look'
+import { frame, readMz3 } from '../mesh'
+import { T } from '../text'
+import type { Mode, ModelDescription } from '../types'
+import { PLAIN_LOOK, SurfaceView } from '../viewer'
+
+const SHOWN = 6
+const FARTHEST_SD = 3
+/** While a slider moves the grid is this much coarser than the model's; the full one follows. */
+const COARSER = 1.5
+const REST_MS = 250
+
+export class Modes {
+  readonly element = h('section', { class: 'card modes' })
+  private readonly view = new SurfaceView(T.modes.surface)
+  private readonly sliders = h('div', { class: 'sliders' })
+  private readonly legendPlace = h('div', { class: 'legend-place' })
+  private readonly told = h('p', { class: 'hint', role: 'status' })
+  private coordinates = new Map<number, number>()
+  private model: ModelDescription | null = null
+  private working = new AbortController()
+  private busy = false
+  private wanted: number | null = null
+  private rest = 0
+  private scale: Scale = scaleAroundZero(new Float32Array([1]))
+
+  constructor(
+    private readonly api: Api,
+    private readonly fail: (fault: unknown) => void,
+  ) {
+    const reset = button(T.modes.reset, () => void this.begin(), { class: 'quiet' })
+    const side = h('div', {}, h('h2', {}, T.modes.title), h('p', { class: 'hint' }, T.modes.how), this.sliders, reset, this.told)
+    replace(this.element, side, h('div', { class: 'stage' }, this.view.element, this.legendPlace))
+  }
+
+  async show(model: ModelDescription): Promise<void> {
+    this.model = model
+    const modes = await this.api.modes(model.name)
+    this.sliders.replaceChildren(...modes.slice(0, SHOWN).map((mode) => this.slider(mode)))
+    await this.begin()
+  }
+
+  private async begin(): Promise<void> {
+    this.coordinates.clear()
+    for (const input of this.sliders.querySelectorAll('input')) {
+      input.value = '0'
+      input.dispatchEvent(new Event('told'))
+    }
+    this.told.textContent = ''
+    await this.fetch(1)
+  }
+
+  private slider(mode: Mode): HTMLElement {
+    const place = h('output', {}, T.modes.sd(0))
+    const input = slider(-FARTHEST_SD, FARTHEST_SD, 0, (value) => this.move(mode.rank, value), 0.1)
+    const id = (input.id = `mode-${mode.rank}`)
+    const tell = (): void => {
+      place.textContent = T.modes.sd(Number(input.value))
+      input.setAttribute('aria-valuetext', T.modes.sd(Number(input.value)))
+    }
+    input.addEventListener('input', tell)
+    input.addEventListener('told', tell)
+    tell()
+    return h('div', { class: 'mode' }, h('label', { for: id }, T.modes.mode(mode.rank, mode.variance_explained)), input, place)
+  }
+
+  private move(rank: number, sd: number): void {
+    this.coordinates.set(rank, sd)
+    this.wanted = performance.now()
+    if (!this.busy) void this.follow()
+  }
+
+  /** One request at a time, always for the newest place; a finer surface once the slider rests. */
+  private async follow(): Promise<void> {
+    this.busy = true
+    window.clearTimeout(this.rest)
+    this.working.abort()
+    while (this.wanted !== null) {
+      const moved = this.wanted
+      this.wanted = null
+      await this.fetch(COARSER)
+      this.element.dataset['latency'] = String(Math.round(performance.now() - moved))
+    }
+    this.busy = false
+    this.rest = window.setTimeout(() => void this.fetch(1), REST_MS)
+  }
+
+  private async fetch(coarser: number): Promise<void> {
+    const model = this.model!
+    this.working.abort()
+    this.working = new AbortController()
+    const { signal } = this.working
+    const query = new URLSearchParams({ format: 'mz3', spacing_mm: String(model.resolution_mm * coarser) })
+    for (const [rank, sd] of this.coordinates) if (sd !== 0) query.append('mode', `${rank}:${sd}`)
+    try {
+      const surface = readMz3(await this.api.bytes(`v1/models/${encodeURIComponent(model.name)}/shape?${query}`, signal))
+      if (surface.scalars) this.scale = scaleAroundZero(surface.scalars)
+      replace(this.legendPlace, surface.scalars && legend(this.scale, T.modes.legend, 'mm'))
+      await this.view.show(surface, { ...PLAIN_LOOK, scale: surface.scalars && this.scale }, null, frame(model.half_extent_mm))
+      if (coarser === 1) this.told.textContent = this.coordinates.size > 0 ? T.modes.fine : ''
+    } catch (fault) {
+      if (!isAbort(fault)) this.fail(fault)
+    }
+  }
+}

@@ -1,0 +1,2 @@
+/** Stands where the viewer would load a codec of chunked image archives. */
+export default class NoCodec {}
