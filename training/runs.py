@@ -21,6 +21,8 @@ CHECKPOINT = "checkpoint.pt"
 RECORD = "run.json"
 #: Folder of TensorBoard events.
 FIGURES = "figures"
+#: Evenly spaced held-out shapes that are measured during training, at most.
+VALIDATED = 32
 #: Figures are logged every so many steps.
 LOG_EVERY = 50
 
@@ -125,7 +127,8 @@ def _validating_watch(trainer: Trainer, cohort: Cohort, writer: SummaryWriter, w
     config = trainer.config
     if not cohort.validation:
         return watch
-    validation = Validation(config, cohort_points(cohort.validation, "dense", config.seed))
+    chosen = cohort.validation[:: -(-len(cohort.validation) // VALIDATED)]
+    validation = Validation(config, cohort_points(chosen, "dense", config.seed))
 
     def validate(step: int, figures: dict[str, float]) -> None:
         watch(step, figures)

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from training.autodecoder import AutoDecoder
 from training.config import TrainingConfig
@@ -25,8 +27,19 @@ class Validation:
 
     def figures(self, module: AutoDecoder) -> dict[str, float]:
         """Cross-entropy (nats a band voxel), soft Dice, and negative log prior density (nats) over held-out shapes."""
-        generator = torch.Generator(device=self._pool.device).manual_seed(self._config.seed)
-        chosen = torch.arange(self._pool.size, device=self._pool.device)
+        codes = self.fitted(module)
+        with torch.no_grad():
+            density = -module.prior.log_density(codes).mean()
+        cross_entropy, dice = self.agreement(module, codes)
+        return {
+            "validation/cross_entropy": cross_entropy,
+            "validation/dice": dice,
+            "validation/negative_log_density": density.item(),
+        }
+
+    def fitted(self, module: AutoDecoder) -> Float[Tensor, "m d"]:
+        """Code of each held-out shape: mode of likelihood and prior, by a fixed number of Adam steps from zero."""
+        generator, chosen = self._generator(0), self._all()
         size = self._config.decoder.latent_size
         codes = torch.zeros(self._pool.size, size, device=self._pool.device, requires_grad=True)
         optimiser = torch.optim.Adam([codes], LEARNING_RATE)
@@ -37,19 +50,19 @@ class Validation:
             loss = (fit - weight * module.prior.log_density(codes)).sum()
             (codes.grad,) = torch.autograd.grad(loss, codes)
             optimiser.step()
-        return self._measure(module, codes.detach(), chosen, generator)
+        return codes.detach()
 
-    def _measure(
-        self, module: AutoDecoder, codes: torch.Tensor, chosen: torch.Tensor, generator: torch.Generator
-    ) -> dict[str, float]:
-        batch = self._pool.draw(chosen, (8 * POINTS[0], 8 * POINTS[1]), generator)
+    def agreement(self, module: AutoDecoder, codes: Float[Tensor, "m d"]) -> tuple[float, float]:
+        """Cross-entropy (nats a band voxel) and soft Dice of codes on points that they were not fitted to."""
+        batch = self._pool.draw(self._all(), (8 * POINTS[0], 8 * POINTS[1]), self._generator(1))
         with torch.no_grad():
             logits = module.decoder(codes, batch.points)
-            fit = cross_entropy_loss(logits, batch.labels, batch.weights).mean()
+            cross_entropy = cross_entropy_loss(logits, batch.labels, batch.weights).mean()
             dice = 1.0 - soft_dice_loss(logits, batch.labels, batch.weights).mean()
-            density = -module.prior.log_density(codes).mean()
-        return {
-            "validation/cross_entropy": fit.item(),
-            "validation/dice": dice.item(),
-            "validation/negative_log_density": density.item(),
-        }
+        return cross_entropy.item(), dice.item()
+
+    def _generator(self, stream: int) -> torch.Generator:
+        return torch.Generator(device=self._pool.device).manual_seed(2 * self._config.seed + stream)
+
+    def _all(self) -> Int[Tensor, "m"]:
+        return torch.arange(self._pool.size, device=self._pool.device)
