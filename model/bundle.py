@@ -50,6 +50,11 @@ class Manifest:
         usual: highest figures that answers from sound drawings usually have (`model.inference.reliability`), estimated
             on validation shapes: ``misfit_mm`` and ``surface_sd_mm`` with five planes, ``misfit_exponent`` and
             ``surface_sd_exponent`` in the number of planes; not judged when empty.
+        posterior: ``sd_scale``, the factor on posterior SDs of the surface, and ``offset_mm``, the SD of an error that
+            the whole surface shares (`model.inference.uncertainty`), estimated on validation shapes; SDs are taken as
+            they are when empty.
+        typical: what real shapes look like to the model (`model.inference.typicality`), from sound drawings of
+            validation shapes; judged by the density of training codes alone when empty.
         training: cohort, cases, regime, command and so on.
         licence, attribution: of the weights.
         accuracy: measured figures by regime, for example ``{"thin": {"dice": 0.87, "asd_mm": 0.34}}``.
@@ -78,6 +83,8 @@ class Manifest:
     anatomy: dict[str, str] = field(default_factory=dict)
     discrepancy: dict[str, float] = field(default_factory=dict)
     usual: dict[str, float] = field(default_factory=dict)
+    posterior: dict[str, float] = field(default_factory=dict)
+    typical: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

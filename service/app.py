@@ -27,6 +27,7 @@ from service.routes.models import models_router
 from service.routes.operations import operations_router
 from service.routes.page import page_router
 from service.routes.planes import planes_router
+from service.routes.posterior import posterior_router
 from service.routes.problems import install_handlers
 from service.routes.reconstructions import reconstructions_router
 from service.routes.results import results_router
@@ -134,6 +135,7 @@ def _add_routes(app: FastAPI) -> None:
         results_router,
         comparisons_router,
         planes_router,
+        posterior_router,
         models_router,
         samples_router,
         jobs_router,

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
+from model.inference.calipers import USUAL_TEXT, parse_extents
 from model.inference.decimation import decimated
 from model.inference.fitting import MirrorRule
 from model.inference.observations import MaskStack
@@ -40,6 +41,9 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machine
 FidelityOption = Annotated[
     float | None, typer.Option(min=0.0, max=1.0, help="0 trusts the model, 1 the slices; the model's when left out.")
 ]
+ExtentsOption = Annotated[
+    str, typer.Option(help="R, A, S, longest, or directions such as 0.5 0 0.87, separated by commas.")
+]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
 
 
@@ -54,6 +58,7 @@ def reconstruct(
     resolution_mm: Annotated[float | None, typer.Option(help="Grid step of the surface (mm).")] = None,
     seed: Annotated[int, typer.Option(min=0, max=use_cases.MAX_SEED, help="Makes the answer repeatable.")] = 0,
     fidelity: FidelityOption = None,
+    extents: ExtentsOption = USUAL_TEXT,
     output: Annotated[Path | None, typer.Option(help="Surface to write; its suffix says the format.")] = None,
     max_error_mm: Annotated[
         float, typer.Option(min=0.0, max=10.0, help="Write fewer triangles, at most this far (mm) from the surface.")
@@ -73,7 +78,8 @@ def reconstruct(
         raise InvalidParameter("--entropy needs --uncertainty laplace or ensemble.", part="--entropy")
     settings = load_settings()
     registry = context.obj(settings)
-    options = Options(parse_annotated(annotated), uncertainty, mirror, resolution_mm, seed, fidelity)
+    choices = uncertainty, mirror, resolution_mm, seed, fidelity, parse_extents(extents)
+    options = Options(parse_annotated(annotated), *choices)
     with progress(STEPS) as watch:
         watch("masks")
         stacks = _read(settings, masks, parse_labels(label or []))
@@ -190,6 +196,7 @@ def _sentences(summary: Summary) -> str:
     lines = [
         f"{summary.model.name} {summary.model.version}: {fit.message} ({fit.iterations} iterations)",
         f"volume {_figure(summary.volume_ml)} mL, surface area {_figure(summary.area_cm2)} cm^2",
+        *(f"extent {one.along}: {_figure(one.extent_mm)} mm" for one in summary.extents),
         f"typicality: percentile {summary.typicality_percentile:.0f} of the training population",
     ]
     if summary.surface_sd is not None:

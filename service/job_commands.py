@@ -10,10 +10,11 @@ from typing import Annotated, Any
 import typer
 
 from model.errors import InvalidParameter
+from model.inference.calipers import USUAL_TEXT, parse_extents
 from model.inference.fitting import MirrorRule
 from model.inference.reconstruction import UncertaintyRule
 from service import use_cases
-from service.commands import FidelityOption, ForceOption, JsonOption, ModelOption
+from service.commands import ExtentsOption, FidelityOption, ForceOption, JsonOption, ModelOption
 from service.console import bar, echo_json, require_free
 from service.errors import NotReady
 from service.job_files import JobFiles
@@ -91,13 +92,14 @@ def reconstruct_job(
     resolution_mm: Annotated[float | None, typer.Option(help="Grid step of the surface (mm).")] = None,
     seed: Annotated[int, typer.Option(min=0, max=use_cases.MAX_SEED, help="Makes the answer repeatable.")] = 0,
     fidelity: FidelityOption = None,
+    extents: ExtentsOption = USUAL_TEXT,
     key: KeyOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Reconstruct each mask of a folder or a ZIP."""
     require_free({"--output": output}, force=force)
-    parse_annotated(annotated), parse_labels(label or [])
+    parse_annotated(annotated), parse_labels(label or []), parse_extents(extents)
     settings = load_settings()
     argument = {
         "model": pinned_name(context.obj(settings).get(model)),
@@ -109,6 +111,7 @@ def reconstruct_job(
         "resolution_mm": resolution_mm,
         "seed": seed,
         "fidelity": fidelity,
+        "extents": extents,
     }
     _begin(settings, RECONSTRUCTIONS_JOB, argument, _archive(masks), key, output, as_json=as_json)
 

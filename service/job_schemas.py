@@ -7,12 +7,13 @@ from fastapi import UploadFile
 from pydantic import BaseModel, ConfigDict, Field
 
 from model.errors import InvalidParameter
+from model.inference.calipers import USUAL_TEXT, parse_extents
 from service.job_ports import JobState
 from service.ports import RECONSTRUCTIONS_JOB, SAMPLES_JOB, MeshFormat, SampleFormat
 from service.schemas import Seed, SpacingMm, parse_annotated, parse_labels
 
 _OF_SAMPLES = ("count", "temperature", "spacing_mm")
-_OF_RECONSTRUCTIONS = ("archive", "label", "annotated", "uncertainty", "mirror", "resolution_mm", "fidelity")
+_OF_RECONSTRUCTIONS = ("archive", "label", "annotated", "uncertainty", "mirror", "resolution_mm", "fidelity", "extents")
 
 
 class JobForm(BaseModel):
@@ -42,6 +43,7 @@ class JobForm(BaseModel):
     mirror: Literal["auto", "never", "always"] = Field("never", description="of reconstructions: as of a single one")
     resolution_mm: SpacingMm | None = Field(None, description="of reconstructions: as of a single one")
     fidelity: float | None = Field(None, ge=0.0, le=1.0, description="of reconstructions: as of a single one")
+    extents: str = Field(USUAL_TEXT, description="of reconstructions: as of a single one")
 
     def argument(self, model: str) -> dict[str, Any]:
         """The job's argument, checked, with the model that it was given to.
@@ -68,6 +70,7 @@ class JobForm(BaseModel):
             raise InvalidParameter(f"The parameter format must be one of: {', '.join(MeshFormat)}.", part="format")
         parse_annotated(self.annotated)
         parse_labels(self.label)
+        parse_extents(self.extents)
         return self.model_dump(include=set(_OF_RECONSTRUCTIONS) - {"archive"})
 
 

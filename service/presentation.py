@@ -4,22 +4,28 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from model.bundle import ShapeModel
+from model.inference.estimates import Estimate, sd_of_estimate
 from model.inference.mask_stack import MaskStack, Plane, section_of
-from model.inference.uncertainty import Estimate
+from model.inference.next_plane import NextPlane
+from service.adapters.mesh_formats import RAMP
 from service.ports import Outcome, StoredResult
 from service.schemas import (
     ActiveDimensions,
+    ColourLegend,
     DrawnPlanes,
     DrawnPlaneSchema,
     EstimateSchema,
+    ExtentSchema,
     FitSchema,
+    GainSchema,
     Links,
     ModelDescription,
     ModelReference,
     ModelSummary,
+    NextPlaneSchema,
     PlaneSchema,
     PoseSchema,
     ResidualSchema,
@@ -56,12 +62,21 @@ def summary_of(outcome: Outcome) -> Summary:
         observations=answer.observation_count,
         planes=[_plane(plane) for plane in answer.planes],
         residuals=[
-            ResidualSchema(plane=_plane(r.plane), disagreement=r.disagreement, mean_error=r.mean_error)
+            ResidualSchema(
+                plane=_plane(r.plane),
+                disagreement=r.disagreement,
+                mean_error=r.mean_error,
+                predictive_p=r.predictive_p,
+            )
             for r in answer.residuals
         ],
         volume_ml=_estimate(answer.volume_ml),
         area_cm2=_estimate(answer.area_cm2),
-        surface_sd=None if sd is None else SurfaceSdSummary(mean_mm=float(sd.mean()), max_mm=float(sd.max())),
+        extents=[
+            ExtentSchema(along=e.along, direction=list(e.direction), extent_mm=_estimate(e.extent_mm))
+            for e in answer.extents
+        ],
+        surface_sd=None if sd is None else _surface_sd(sd),
         log_prior_density_nats=answer.log_prior_density,
         typicality_percentile=answer.typicality_percentile,
         warnings=list(answer.warnings),
@@ -78,6 +93,8 @@ def result_summary(result: StoredResult, address: str) -> ResultSummary:
         occupancy=f"{address}/occupancy",
         uncertainty=f"{address}/uncertainty" if uncertain else None,
         surface_sd=f"{address}/uncertainty?kind=surface_sd" if uncertain else None,
+        posterior=f"{address}/posterior" if uncertain else None,
+        next_plane=f"{address}/next-plane" if uncertain else None,
     )
     return ResultSummary(
         id=result.id,
@@ -101,6 +118,22 @@ def drawn_planes(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> DrawnP
             )
             for plane in planes
         ],
+    )
+
+
+def next_plane_summary(outcome: Outcome, found: NextPlane) -> NextPlaneSchema:
+    """The wire form of the plane to draw next, of an outcome with uncertainty."""
+    answer = outcome.reconstruction
+    sd = float(answer.mesh.scalars[SURFACE_SD].mean())
+    volume = sd_of_estimate(answer.volume_ml)
+    plane = found.cut.plane
+    return NextPlaneSchema(
+        plane=None if plane is None else _plane(plane),
+        origin_mm=found.cut.origin.tolist(),
+        normal=found.cut.normal.tolist(),
+        surface_sd_mm=GainSchema(now=sd, expected=sd * found.surface_share),
+        volume_sd_ml=GainSchema(now=volume, expected=volume * found.volume_share),
+        considered=found.considered,
     )
 
 
@@ -142,6 +175,15 @@ def _runs(section: Bool[np.ndarray, "a b"]) -> list[list[int]]:
     """Foreground of a plane as [start, length] of its voxels by rows."""
     change = np.flatnonzero(np.diff(section.ravel(), prepend=False, append=False))
     return [[int(start), int(end - start)] for start, end in zip(change[::2], change[1::2], strict=True)]
+
+
+def _surface_sd(sd: Float[np.ndarray, "v"]) -> SurfaceSdSummary:
+    top = float(sd.max())
+    legend = ColourLegend(
+        values_mm=[top * number / (len(RAMP) - 1) for number in range(len(RAMP))],
+        colours=["#{:02x}{:02x}{:02x}".format(*colour) for colour in RAMP],
+    )
+    return SurfaceSdSummary(mean_mm=float(sd.mean()), max_mm=top, legend=legend)
 
 
 def _plane(plane: Plane) -> PlaneSchema:

@@ -8,12 +8,19 @@ from fastapi import UploadFile
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from model.errors import InvalidParameter
+from model.inference.calipers import USUAL_TEXT, parse_extents
+from model.inference.next_plane import Among
 from model.inference.observations import AnnotatedRule, Plane
 from model.inference.reconstruction import Options
 from service.ports import MeshFormat, SampleFormat
 from service.use_cases import MAX_SEED
 
 SpacingMm = Annotated[float, Field(ge=0.25, le=10.0, allow_inf_nan=False, description="grid step (mm)")]
+#: Description of the part `extents`.
+EXTENTS = (
+    "extents of the surface to measure, separated by commas: R, A and S along the axes of the world, longest between "
+    "any two points, or a direction as three numbers with blanks between them, such as 0.5 0 0.87"
+)
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED, description="makes the answer repeatable")]
 
 
@@ -51,11 +58,13 @@ class ReconstructionForm(_Closed):
         description="0 trusts the model, 1 trusts the slices: share of what the model leaves unexplained on the slices "
         "that the surface follows; the one calibrated for the model when left out",
     )
+    extents: str = Field(USUAL_TEXT, description=EXTENTS)
 
     def options(self) -> Options:
         """The choices as domain types."""
         annotated = parse_annotated(self.annotated)
-        return Options(annotated, self.uncertainty, self.mirror, self.resolution_mm, self.seed, self.fidelity)
+        choices = self.uncertainty, self.mirror, self.resolution_mm, self.seed, self.fidelity
+        return Options(annotated, *choices, parse_extents(self.extents))
 
 
 class PlanesForm(_Closed):
@@ -93,6 +102,24 @@ class UncertaintyQuery(VolumeQuery):
 
     kind: Literal["entropy", "surface_sd"] = Field(
         "entropy", description="voxel entropy (nats, NIfTI) or standard deviation of the surface (mm, JSON)"
+    )
+
+
+class PosteriorQuery(_Closed):
+    """Query of shapes from the posterior."""
+
+    format: MeshFormat = Field(MeshFormat.PLY, description="file format")
+    count: int = Field(16, ge=1, description="how many; larger than the service's limit is refused with 413")
+    seed: Seed = 0
+    spacing_mm: SpacingMm | None = Field(None, description="grid step (mm); that of the result when left out")
+
+
+class NextPlaneQuery(_Closed):
+    """Query of the plane to draw next."""
+
+    planes: Among = Field(
+        "grid",
+        description="which planes compete: grid (those of the input's grid, along all three axes) or free (any)",
     )
 
 
@@ -154,6 +181,14 @@ class EstimateSchema(BaseModel):
     high: float | None
 
 
+class ExtentSchema(BaseModel):
+    """An extent of the surface along a direction."""
+
+    along: str = Field(description="as it was asked for: R, A, S, longest, or three numbers")
+    direction: list[float] = Field(description="unit vector (RAS)")
+    extent_mm: EstimateSchema
+
+
 class ModelReference(BaseModel):
     """Which model made a result."""
 
@@ -180,11 +215,20 @@ class PoseSchema(BaseModel):
     mirrored: bool
 
 
+class ColourLegend(BaseModel):
+    """What the vertex colours of a mesh in GLB mean; values between two stops are mixed linearly."""
+
+    scalar: Literal["surface_sd_mm"] = "surface_sd_mm"
+    values_mm: list[float] = Field(description="standard deviation (mm) at each stop")
+    colours: list[str] = Field(description="sRGB at each stop, as #rrggbb")
+
+
 class SurfaceSdSummary(BaseModel):
     """Standard deviation of the surface along its normal (mm)."""
 
     mean_mm: float
     max_mm: float
+    legend: ColourLegend
 
 
 class ResidualSchema(BaseModel):
@@ -193,6 +237,10 @@ class ResidualSchema(BaseModel):
     plane: PlaneSchema
     disagreement: float = Field(description="1 - Dice between the drawing and the reconstruction's section, 0 to 1")
     mean_error: float = Field(description="mean of label minus probability")
+    predictive_p: float | None = Field(
+        description="how probable it is that a sound drawing disagrees at least as much with its reconstruction; null "
+        "for a model that was not calibrated for it"
+    )
 
 
 class Links(BaseModel):
@@ -204,6 +252,8 @@ class Links(BaseModel):
     occupancy: str
     uncertainty: str | None = Field(description="null when uncertainty was not asked for")
     surface_sd: str | None = Field(description="null when uncertainty was not asked for")
+    posterior: str | None = Field(description="null when uncertainty was not asked for")
+    next_plane: str | None = Field(description="null when uncertainty was not asked for")
 
 
 class Summary(BaseModel):
@@ -221,9 +271,12 @@ class Summary(BaseModel):
     residuals: list[ResidualSchema]
     volume_ml: EstimateSchema
     area_cm2: EstimateSchema
+    extents: list[ExtentSchema]
     surface_sd: SurfaceSdSummary | None
     log_prior_density_nats: float
-    typicality_percentile: float = Field(description="share of the training population with a lower density, 0 to 100")
+    typicality_percentile: float = Field(
+        description="percentage of real shapes, soundly drawn, that look less like the population, 0 to 100"
+    )
     warnings: list[str]
 
 
@@ -242,6 +295,26 @@ class SurfaceSd(BaseModel):
     space: Literal["RAS"] = "RAS"
     unit: Literal["mm"] = "mm"
     surface_sd_mm: list[float]
+
+
+class GainSchema(BaseModel):
+    """A standard deviation now, and as it is expected after the plane was drawn."""
+
+    now: float
+    expected: float
+
+
+class NextPlaneSchema(BaseModel):
+    """Where to draw next."""
+
+    space: Literal["RAS"] = "RAS"
+    unit: Literal["mm"] = "mm"
+    plane: PlaneSchema | None = Field(description="plane of voxels of the first mask; null for a free one")
+    origin_mm: list[float] = Field(description="a point of the plane, the middle of the expected section")
+    normal: list[float] = Field(description="unit vector")
+    surface_sd_mm: GainSchema = Field(description="mean standard deviation of the surface along its normal")
+    volume_sd_ml: GainSchema = Field(description="standard deviation of the volume")
+    considered: int = Field(description="how many planes were compared")
 
 
 class ModelSummary(BaseModel):

@@ -12,7 +12,10 @@ from model.geometry import Grid, Pose
 from model.inference.comparison import compared
 from model.inference.fitting import Fit, FitStatus
 from model.inference.mesh import Mesh
+from model.inference.next_plane import Among, NextPlane
+from model.inference.next_plane import next_plane as best_plane
 from model.inference.observations import AnnotatedRule, MaskStack, Plane, find_planes
+from model.inference.posterior_shapes import PosteriorShape, draw_posterior
 from model.inference.reconstruction import Options, Watch
 from model.inference.reconstruction import reconstruct as infer
 from model.inference.sampling import SampledShape, draw_shape
@@ -94,6 +97,50 @@ def annotated_planes(stacks: tuple[MaskStack, ...], rule: AnnotatedRule | Sequen
 def compare(outcome: Outcome, other: Outcome) -> Mesh:
     """Surface of an outcome with its signed distance (mm) to another's, both in the world of their inputs."""
     return compared(outcome.reconstruction.mesh, other.reconstruction.mesh)
+
+
+def next_plane(catalogue: Catalogue, outcome: Outcome, among: Among) -> NextPlane:
+    """The plane that would reduce the expected uncertainty most.
+
+    Raises:
+        NotComputed: without uncertainty, or the model that made the outcome is no longer loaded.
+        InvalidParameter: every plane of the input's grid that cuts the surface is drawn.
+    """
+    _require_uncertainty(outcome)
+    answer = outcome.reconstruction
+    model = _same_model(catalogue, outcome)
+    return best_plane(model, answer.state.fits[0], answer.mesh, outcome.grid, answer.planes, among)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Shapes that a reconstruction could also be.
+
+    Attributes:
+        spacing_mm: grid step of their surfaces; the model's when None.
+    """
+
+    model: ShapeModel
+    outcome: Outcome
+    spacing_mm: float | None
+
+    def draw(self, seed: int) -> PosteriorShape:
+        """One of them, a pure function of the outcome, the spacing and the seed."""
+        return draw_posterior(self.model, self.outcome.reconstruction.state, seed, self.spacing_mm)
+
+
+def posterior(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int) -> Posterior:
+    """The posterior of an outcome, at the outcome's resolution when no spacing is given.
+
+    Raises:
+        NotComputed: without uncertainty, or the model that made the outcome is no longer loaded.
+        TooLarge: a surface's grid would have more voxels than allowed.
+    """
+    _require_uncertainty(outcome)
+    model = _same_model(catalogue, outcome)
+    step = outcome.options.resolution_mm if spacing_mm is None else spacing_mm
+    require_step(model, step, max_voxels)
+    return Posterior(model, outcome, step)
 
 
 def draw(model: ShapeModel, seed: int, temperature: float, spacing_mm: float | None, max_voxels: int) -> SampledShape:

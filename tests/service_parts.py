@@ -17,11 +17,13 @@ from jaxtyping import Float
 
 from model.bundle import ShapeModel
 from model.geometry import Grid, Pose
+from model.inference.calipers import Extent
+from model.inference.estimates import Estimate
 from model.inference.fitting import Fit, FitStatus
 from model.inference.mesh import Mesh
 from model.inference.observations import Plane
 from model.inference.reconstruction import Options, PlaneResidual, Reconstruction
-from model.inference.uncertainty import Estimate, ShapeState
+from model.inference.uncertainty import ShapeState
 from service.app import create_app
 from service.model_registry import ModelRegistry
 from service.observability import make_log
@@ -127,6 +129,7 @@ def outcome_of(model: ShapeModel | None = None, *, uncertain: bool = True, seed:
         residuals=(PlaneResidual(plane, 0.1, -0.02),),
         volume_ml=Estimate(1.0, *interval),
         area_cm2=Estimate(2.0, *interval),
+        extents=(Extent("R", (1.0, 0.0, 0.0), Estimate(3.0, *interval)),),
         log_prior_density=-3.5,
         typicality_percentile=42.0,
         warnings=("It is small.",),

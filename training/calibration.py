@@ -4,7 +4,8 @@ Neighbouring voxels are not independent, so the sum of their log likelihoods ove
 precision), and what the code leaves unexplained at a contour is partly the shape's, partly the annotator's (spread and
 fidelity of the discrepancy). Precision and fidelity are those that leave the fewest voxels near the true surface on its
 wrong side, the lowest of those that hardly differ; the spread, which moves no surface, is the one with the lowest
-cross-entropy of the posterior mean occupancy there, a proper score.
+cross-entropy of the posterior mean occupancy there, a proper score. With these, answers to sound drawings tell what is
+usual and typical for the model (`training.usual`) and how wide its SDs have to be (`training.posterior_scale`).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
-from model.bundle import ShapeModel, open_bundle, write_manifest
+from model.bundle import Manifest, ShapeModel, open_bundle, write_manifest
 from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
 from model.inference.fitting import Fit, FitOptions, fit
 from model.inference.observations import observe
@@ -31,8 +32,9 @@ from model.inference.reconstruction import OBSERVATION_BUDGET
 from model.inference.thick_slices import through_thickness
 from training.cohorts.cohort import Case, Cohort
 from training.config import Regime
+from training.posterior_scale import posterior_scale
 from training.sparsify import for_evaluation
-from training.usual import usual_figures
+from training.usual import sound_answers, typical_figures, usual_figures
 
 #: Precisions that are tried (1/mm^2), fidelities, spreads (mm), and the regimes that they are tried on.
 PRECISIONS = (0.1, 0.2, 0.4, 0.8)
@@ -44,8 +46,8 @@ BAND_MM = 5.0
 SCORED_VOXELS = 4000
 #: Errors that differ by less than this share count as equal: the least precision then gives the quickest fit.
 TIE = 0.005
-#: Evenly spaced validation cases that are used.
-CASES = 8
+#: Evenly spaced validation cases that are used, and those whose sound drawings are answered in the end.
+CASES, JUDGED_CASES = 8, 12
 
 Watch = Callable[[float], None]
 
@@ -123,10 +125,23 @@ def calibrate_bundle(folder: Path, cohort: Cohort, watch: Watch = lambda precisi
     changed = replace(
         model.manifest, likelihood_precision=found.best.precision, discrepancy=discrepancy, calibration=facts
     )
-    judged = replace(model, manifest=changed)
-    changed = replace(changed, usual=usual_figures(judged, cohort.validation[:: -(-len(cohort.validation) // CASES)]))
-    write_manifest(changed, folder)
+    write_manifest(with_sound_drawings(replace(model, manifest=changed), cohort.validation, watch), folder)
     return found
+
+
+def with_sound_drawings(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda precision: None) -> Manifest:
+    """The manifest with what answers to sound drawings of validation cases show: usual, typical, width of SDs."""
+    chosen = cases[:: -(-len(cases) // JUDGED_CASES)]
+    sound = sound_answers(model, chosen)
+    watch(model.manifest.likelihood_precision)
+    facts = {**model.manifest.calibration, "sound_drawings": len(sound), "sound_cases": len(chosen)}
+    return replace(
+        model.manifest,
+        calibration=facts,
+        usual=usual_figures(sound),
+        typical=typical_figures(sound, len(chosen)),
+        posterior=posterior_scale(sound),
+    )
 
 
 def with_precision(model: ShapeModel, precision: float) -> ShapeModel:

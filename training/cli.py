@@ -116,19 +116,21 @@ def calibrate(
 ) -> None:
     """Choose on validation shapes how much a drawn mm^2 is worth and how far slices are followed; record both."""
     with exit_status():
+        from model.bundle import read_manifest
         from training.calibration import PRECISIONS, calibrate_bundle
 
         options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
         found = open_cohort(cohort, masks, data, options, labels=tuple(label or ()))
         if not found.validation:
             raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
-        with progress(len(PRECISIONS), f"calibrating on {found.name}") as bar:
+        with progress(len(PRECISIONS) + 1, f"calibrating on {found.name}") as bar:
             chosen = calibrate_bundle(bundle, found, lambda precision: bar.advance(bar.task_ids[0]))
         best = chosen.best
         summary = {
             "likelihood_precision": best.precision,
             "fidelity": best.fidelity,
             "spread_mm": best.spread_mm,
+            "posterior": read_manifest(bundle)[0].posterior,
             "error_by_precision_and_fidelity": chosen.errors(),
             "cross_entropy_by_spread": chosen.cross_entropies(),
         }

@@ -1,41 +1,96 @@
 """What answers from sound drawings usually say about themselves, measured on validation shapes.
 
-Figures of `model.inference.reliability`, over drawings of three planes and more: largest orthogonal slices, every 8th
-axial one, and parallel ones across the longest axis. A power of the number of planes is fitted to each figure; the
-highest usual value is that line moved up to a high quantile of the drawings.
+Figures of `model.inference.reliability` and `model.inference.typicality`, over drawings of three planes and more:
+largest orthogonal slices, every 8th axial one, and parallel ones across the longest axis. A power of the number of
+planes is fitted to each figure; the highest usual value is that line moved up to a high quantile of the drawings.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from model.bundle import ShapeModel
+from model.inference.agreement import sections_of as compared
 from model.inference.discrepancy.conditioning import discrepancy_prior
+from model.inference.mesh import vertex_areas, volume_ml
 from model.inference.observations import observe
+from model.inference.posterior import fitted_logits
 from model.inference.reconstruction import OBSERVATION_BUDGET, Options, reconstruct
 from model.inference.reliability import USUAL_PLANES, Figures, figures_of
+from model.inference.uncertainty import surface_spread
 from training.cohorts.cohort import Case
 from training.perturb import Sections, parallel, sections_of
 from training.sparsify import for_evaluation
+from training.surface_error import digitisation_mm, distances_to, true_points
 
 #: Share of sound drawings that stay below the highest usual value of one figure.
 USUAL_QUANTILE = 0.95
 #: Numbers of parallel planes.
 PARALLEL = (3, 5, 8)
+#: SDs (of logarithms, and of nats) are not taken for smaller than these, whatever a few shapes show.
+LEAST_SD = {"misfit": 0.15, "density": 1.0, "slice": 0.2}
 
 
-def usual_figures(model: ShapeModel, cases: Sequence[Case]) -> dict[str, float]:
-    """`Manifest.usual` of a model, from cases that it was not trained on."""
-    # What was usual before is forgotten, lest it change the fits.
-    unjudged = replace(model, manifest=replace(model.manifest, usual={}))
-    found = [measured(unjudged, drawing) for case in cases for drawing in sound_drawings(case)]
-    planes = np.array([one.planes for one in found], float)
+@dataclass(frozen=True)
+class Sound:
+    """An answer to a sound drawing beside the truth.
+
+    Attributes:
+        figures: what it says about itself.
+        density: log prior density of the code (nats).
+        surprises: of each plane, see `model.inference.agreement.Section`.
+        surface_error_mm, surface_sd_mm: RMS over vertices: distance from the true surface, less what digitising it
+            adds, and posterior SD.
+        volume_error_ml, volume_sd_ml: of the volume, the SD by the posterior as it is.
+        swelling_ml: how much the volume grows when the whole surface moves out by 1 mm.
+    """
+
+    figures: Figures
+    density: float
+    surprises: tuple[float, ...]
+    surface_error_mm: float
+    surface_sd_mm: float
+    volume_error_ml: float
+    volume_sd_ml: float
+    swelling_ml: float
+
+
+def sound_answers(model: ShapeModel, cases: Sequence[Case]) -> list[Sound]:
+    """Answers to sound drawings of cases that a model was not trained on."""
+    # What was known before is forgotten, lest it change the answers.
+    unjudged = replace(model, manifest=replace(model.manifest, usual={}, posterior={}, typical={}))
+    return [answered(unjudged, case, drawing) for case in cases for drawing in sound_drawings(case)]
+
+
+def usual_figures(sound: Sequence[Sound]) -> dict[str, float]:
+    """`Manifest.usual` of a model."""
+    planes = np.array([one.figures.planes for one in sound], float)
     return {
-        **_line("misfit", planes, np.array([one.misfit_mm for one in found])),
-        **_line("surface_sd", planes, np.array([one.surface_sd_mm for one in found])),
+        **_line("misfit", planes, np.array([one.figures.misfit_mm for one in sound])),
+        **_line("surface_sd", planes, np.array([one.figures.surface_sd_mm for one in sound])),
     }
+
+
+def typical_figures(sound: Sequence[Sound], cases: int) -> dict[str, float]:
+    """`Manifest.typical` of a model, from drawings of so many cases.
+
+    Drawings of one case are much alike, so the degrees of freedom are those of two answers a case.
+    """
+    planes = np.array([one.figures.planes for one in sound], float)
+    across, misfits = np.log(planes / USUAL_PLANES), _logs(np.array([one.figures.misfit_mm for one in sound]))
+    exponent = _exponent(across, misfits)
+    samples = {
+        "misfit": misfits - exponent * across,
+        "density": np.array([one.density for one in sound]),
+        "slice": np.concatenate([one.surprises for one in sound]),
+    }
+    found = {"freedom": float(max(2 * cases - 1, 3)), "misfit_exponent": round(exponent, 4)}
+    for name, values in samples.items():
+        found[f"{name}_mean"] = round(float(values.mean()), 4)
+        found[f"{name}_sd"] = round(max(LEAST_SD[name], float(values.std(ddof=1))), 4)
+    return found
 
 
 def sound_drawings(case: Case) -> Iterator[Sections]:
@@ -46,17 +101,40 @@ def sound_drawings(case: Case) -> Iterator[Sections]:
         yield parallel(case.mask, case.grid, count)
 
 
-def measured(model: ShapeModel, drawing: Sections) -> Figures:
-    """Figures of the answer to a drawing."""
-    answer = reconstruct(model, drawing.stacks, Options(annotated=drawing.planes, uncertainty="none"))
+def answered(model: ShapeModel, case: Case, drawing: Sections) -> Sound:
+    """The answer to a drawing of a case, measured."""
+    answer = reconstruct(model, drawing.stacks, Options(annotated=drawing.planes))
+    found, mesh = answer.state.fits[0], answer.mesh
     observations = observe(drawing.stacks, drawing.planes, budget=OBSERVATION_BUDGET, seed=0)
-    prior = discrepancy_prior(model.manifest)
-    return figures_of(model, answer.state.fits[0], drawing.stacks, observations, answer.mesh, prior)
+    figures = figures_of(model, found, drawing.stacks, observations, mesh, discrepancy_prior(model.manifest))
+    sections = compared(observations, fitted_logits(model, found, observations.points), found.plane_weights)
+    spread, sd = surface_spread(model, answer.state, mesh), mesh.scalars["surface_sd_mm"]
+    swelling = vertex_areas(mesh) / 1000.0
+    errors = np.square(distances_to(true_points(case.mask, case.grid), mesh.vertices)).mean()
+    truth = float(case.mask.sum() * np.prod(case.grid.spacing)) / 1000.0
+    return Sound(
+        figures=figures,
+        density=answer.log_prior_density,
+        surprises=tuple(section.surprise for section in sections),
+        surface_error_mm=float(np.sqrt(max(errors - digitisation_mm(case.grid) ** 2, 0.0))),
+        surface_sd_mm=float(np.sqrt(np.square(sd).mean())),
+        volume_error_ml=volume_ml(mesh) - truth,
+        volume_sd_ml=0.0 if spread is None else spread.sd_of(swelling),
+        swelling_ml=float(swelling.sum()),
+    )
 
 
 def _line(name: str, planes: Float[np.ndarray, "n"], values: Float[np.ndarray, "n"]) -> dict[str, float]:
     """Highest usual value at `USUAL_PLANES` and the exponent of the number of planes."""
-    across, logs = np.log(planes / USUAL_PLANES), np.log(np.maximum(values, 1e-6))
-    exponent = float(np.polyfit(across, logs, 1)[0]) if np.ptp(across) > 0 else 0.0
+    across, logs = np.log(planes / USUAL_PLANES), _logs(values)
+    exponent = _exponent(across, logs)
     highest = float(np.exp(np.quantile(logs - exponent * across, USUAL_QUANTILE)))
     return {f"{name}_mm": round(highest, 4), f"{name}_exponent": round(exponent, 4)}
+
+
+def _logs(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    return np.asarray(np.log(np.maximum(values, 1e-6)))
+
+
+def _exponent(across: Float[np.ndarray, "n"], logs: Float[np.ndarray, "n"]) -> float:
+    return float(np.polyfit(across, logs, 1)[0]) if np.ptp(across) > 0 else 0.0

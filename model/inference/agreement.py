@@ -13,6 +13,9 @@ from model.inference.observations import Observations
 #: The answer names a plane whose section is wrong by more than this share of itself and of the mean drawn section.
 DISAGREEMENT_LIMIT = 0.25
 
+#: Cross-entropies of a plane (nats mm^2) below about this much tell nothing.
+LEAST_MM2 = 5.0
+
 
 @dataclass(frozen=True)
 class Section:
@@ -22,6 +25,7 @@ class Section:
         plane: which plane.
         drawn, reconstructed, shared: area (mm^2) of the drawing, of the reconstruction's section and of both.
         mean_error: mean of label minus probability.
+        surprise: log ratio of the labels' cross-entropy to what it would be for labels drawn from the field.
         trusted: whether the fit used the plane.
     """
 
@@ -30,6 +34,7 @@ class Section:
     reconstructed: float
     shared: float
     mean_error: float
+    surprise: float
     trusted: bool = True
 
     @property
@@ -53,6 +58,7 @@ def sections_of(
         plane_weights: trust in each plane (`Fit.plane_weights`); all are trusted when None.
     """
     error = observations.labels - expit(logits.astype(float))
+    found, expected = cross_entropies(logits.astype(float), observations.labels)
     drawn, inside = observations.labels * observations.weights, (logits > 0) * observations.weights
     sections = []
     for number, plane in enumerate(observations.planes):
@@ -61,8 +67,18 @@ def sections_of(
             shared = float(inside[here] @ observations.labels[here])
             trusted = plane_weights is None or bool(plane_weights[number] > 0)
             areas = float(drawn[here].sum()), float(inside[here].sum()), shared
-            sections.append(Section(plane, *areas, float(error[here].mean()), trusted))
+            weights = observations.weights[here]
+            surprise = np.log((weights @ found[here] + LEAST_MM2) / (weights @ expected[here] + LEAST_MM2))
+            sections.append(Section(plane, *areas, float(error[here].mean()), float(surprise), trusted))
     return sections
+
+
+def cross_entropies(
+    logits: Float[np.ndarray, "n"], labels: Float[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Cross-entropy (nats) of each label, and its expectation over labels drawn from the field."""
+    partition = np.logaddexp(0.0, logits)
+    return partition - labels * logits, partition - expit(logits) * logits
 
 
 def disagreeing_planes(sections: Sequence[Section]) -> list[Plane]:

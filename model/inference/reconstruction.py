@@ -7,23 +7,29 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import numpy as np
-
 from model.bundle import ShapeModel
 from model.errors import InvalidMask, InvalidParameter
-from model.inference.agreement import plane_warnings, sections_of
+from model.inference.agreement import disagreeing_planes, plane_warnings, sections_of
+from model.inference.calipers import USUAL_EXTENTS, Extent, direction_of, measure_extents
 from model.inference.coverage import coverage_warnings
 from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_prior, with_discrepancy
 from model.inference.ensemble import fit_ensemble
+from model.inference.estimates import Estimate
 from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
 from model.inference.mesh import Mesh
 from model.inference.objective import reweighted
 from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
 from model.inference.posterior import fitted_logits, laplace_covariance
-from model.inference.reliability import figures_of, less_trusting, reliability_warnings
+from model.inference.reliability import figures_of, less_trusting, reliability_warnings, thickness_warnings
 from model.inference.surface import surface_of
 from model.inference.thick_slices import through_thickness
-from model.inference.uncertainty import Estimate, ShapeState, area_estimate, surface_spread, volume_estimate
+from model.inference.typicality import (
+    predictive_probabilities,
+    predictive_warnings,
+    typicality,
+    typicality_warnings,
+)
+from model.inference.uncertainty import ShapeState, area_estimate, surface_spread, volume_estimate
 
 UncertaintyRule = Literal["laplace", "ensemble", "none"]
 #: Called with the name of each stage as it begins: observations, fit, surface, uncertainty.
@@ -33,8 +39,6 @@ Watch = Callable[[str], None]
 OBSERVATION_BUDGET = 2500
 #: Range of `Options.resolution_mm`.
 RESOLUTION_RANGE_MM = (0.25, 10.0)
-#: Below this percentile of the training population a shape is called unlike it.
-ATYPICAL_PERCENTILE = 1.0
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class Options:
         seed: makes the answer repeatable.
         fidelity: from 0, trust the model, to 1, trust the slices: share of what the code leaves unexplained on the
             slices that the surface follows; the one calibrated for the model when None.
+        extents: what is measured of the surface, see `model.inference.calipers`.
     """
 
     annotated: AnnotatedRule | tuple[Plane, ...] = "auto"
@@ -57,6 +62,7 @@ class Options:
     resolution_mm: float | None = None
     seed: int = 0
     fidelity: float | None = None
+    extents: tuple[str, ...] = USUAL_EXTENTS
 
 
 @dataclass(frozen=True)
@@ -67,11 +73,14 @@ class PlaneResidual:
         plane: which plane.
         disagreement: 1 - Dice between the drawing and the reconstruction's section, 0 to 1.
         mean_error: mean signed occupancy residual (label minus probability).
+        predictive_p: how probable it is that a sound drawing disagrees at least as much with its reconstruction; None
+            where the model does not know.
     """
 
     plane: Plane
     disagreement: float
     mean_error: float
+    predictive_p: float | None = None
 
 
 @dataclass(frozen=True)
@@ -84,9 +93,9 @@ class Reconstruction:
         planes: planes that were used.
         observation_count: number of point observations.
         residuals: disagreement of each plane.
-        volume_ml, area_cm2: figures with 90 % intervals.
+        volume_ml, area_cm2, extents: figures with 90 % intervals.
         log_prior_density: nats.
-        typicality_percentile: share of the training population with a lower density, 0 to 100.
+        typicality_percentile: percentage of real shapes that are less like the population, 0 to 100.
         warnings: plain sentences, for example that the shape is unlike the training population.
     """
 
@@ -97,6 +106,7 @@ class Reconstruction:
     residuals: tuple[PlaneResidual, ...]
     volume_ml: Estimate
     area_cm2: Estimate
+    extents: tuple[Extent, ...]
     log_prior_density: float
     typicality_percentile: float
     warnings: tuple[str, ...]
@@ -139,20 +149,29 @@ def reconstruct(
         mesh = replace(mesh, scalars={"surface_sd_mm": spread.sd()})
     trusted = observations if found.plane_weights is None else reweighted(observations, found.plane_weights)
     sections = sections_of(observations, fitted_logits(model, found, observations.points), found.plane_weights)
-    density, percentile = typicality(model, found)
     figures = figures_of(model, found, stacks, drawing, mesh, usual)
+    thick = thickness_warnings(stacks, observations.planes, mesh)
+    density, percentile = typicality(model, found, replace(figures, misfit_mm=0.0) if thick else figures)
+    probabilities = predictive_probabilities(model, sections)
+    named = [*disagreeing_planes(sections), *filter(None, [_doubted(observations, found)])]
     return Reconstruction(
         state=state,
         mesh=mesh,
         planes=observations.planes,
         observation_count=len(observations.points),
-        residuals=tuple(PlaneResidual(s.plane, s.disagreement, s.mean_error) for s in sections),
+        residuals=tuple(
+            PlaneResidual(s.plane, s.disagreement, s.mean_error, p)
+            for s, p in zip(sections, probabilities, strict=True)
+        ),
         volume_ml=volume_estimate(mesh, spread),
         area_cm2=area_estimate(mesh, spread),
+        extents=measure_extents(mesh, spread, options.extents),
         log_prior_density=density,
         typicality_percentile=percentile,
-        warnings=_warnings(found, percentile)
+        warnings=_warnings(found)
+        + typicality_warnings(model, percentile)
         + plane_warnings(sections, _doubted(observations, found))
+        + predictive_warnings(sections, probabilities, named)
         + coverage_warnings(trusted, mesh.vertices)
         + reliability_warnings(model.manifest.usual, figures, stacks, observations.planes, mesh),
     )
@@ -179,6 +198,8 @@ def _check(options: Options) -> None:
             f"fidelity is {options.fidelity:g}; 0 (trust the model) to 1 (trust the slices) is accepted.",
             part="fidelity",
         )
+    for along in options.extents:
+        direction_of(along)
     if options.seed < 0:
         raise InvalidParameter(f"seed is {options.seed}; a whole number from 0 is accepted.", part="seed")
 
@@ -193,18 +214,9 @@ def _state(
     return ShapeState((found,), laplace_covariance(found) if options.uncertainty == "laplace" else None)
 
 
-def typicality(model: ShapeModel, found: Fit) -> tuple[float, float]:
-    """Log prior density of the fitted code (nats) and its percentile in the training population."""
-    density = float(model.prior.log_density(found.latent[None])[0][0])
-    return density, float(100.0 * np.mean(model.population.log_densities < density))
-
-
 def _doubted(observations: Observations, found: Fit) -> Plane | None:
     return None if found.doubted is None else observations.planes[found.doubted]
 
 
-def _warnings(found: Fit, percentile: float) -> tuple[str, ...]:
-    sentences = [] if found.status == "converged" else [found.message]
-    if percentile < ATYPICAL_PERCENTILE:
-        sentences.append("The shape is unlike the population that the model was trained on; do not rely on it.")
-    return tuple(sentences)
+def _warnings(found: Fit) -> tuple[str, ...]:
+    return () if found.status == "converged" else (found.message,)

@@ -12,6 +12,7 @@ from scipy.special import expit
 
 from model.bundle import ShapeModel
 from model.geometry import Grid
+from model.inference.estimates import Estimate, estimate_of
 from model.inference.fitting import Fit
 from model.inference.mesh import Mesh, area_cm2, area_gradient, vertex_areas, volume_ml
 from model.inference.posterior import (
@@ -25,19 +26,8 @@ from model.inference.posterior import (
 from model.inference.spread import LocalSpread, SurfaceSpread
 from model.inference.surface import canonical_box
 
-#: Two-sided 90 % quantile of the normal distribution.
-NINETY_PERCENT = 1.6448536269514722
 #: Beyond this logit the posterior variance cannot move a probability visibly.
 SATURATED_LOGIT = 12.0
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A figure with its 90 % interval; `low` and `high` are None when uncertainty was not asked for."""
-
-    value: float
-    low: float | None
-    high: float | None
 
 
 @dataclass(frozen=True)
@@ -63,8 +53,10 @@ def surface_spread(model: ShapeModel, state: ShapeState, mesh: Mesh) -> SurfaceS
     found = state.fits[0]
     if state.covariance is not None:
         _, by_parameter, by_point = fitted_jacobians(model, found, mesh.vertices)
-        factors = normal_displacements(by_parameter, by_point) @ np.linalg.cholesky(state.covariance)
-        return SurfaceSpread(factors, _local_spread(found, mesh, by_point))
+        scale, offset = calibrated_scale(model)
+        factors = scale * normal_displacements(by_parameter, by_point) @ np.linalg.cholesky(state.covariance)
+        shared = np.full((len(factors), 1), offset)
+        return SurfaceSpread(np.hstack([factors, shared]), _local_spread(found, mesh, by_point, scale))
     if state.members:
         _, _, by_point = fitted_jacobians(model, found, mesh.vertices)
         logits = np.stack([fitted_logits(model, member, mesh.vertices) for member in state.members], axis=1)
@@ -73,28 +65,31 @@ def surface_spread(model: ShapeModel, state: ShapeState, mesh: Mesh) -> SurfaceS
     return None
 
 
-def _local_spread(found: Fit, mesh: Mesh, by_point: Float[np.ndarray, "v 3"]) -> LocalSpread | None:
+def calibrated_scale(model: ShapeModel) -> tuple[float, float]:
+    """Factor on posterior SDs of the surface, and SD (mm) of an error that the whole surface shares.
+
+    The posterior knows neither that its approximations make it too narrow or too wide for the model, nor errors that
+    all contours have in common, such as half a voxel to one side. Both move figures of the whole surface most.
+    """
+    known = model.manifest.posterior
+    return known.get("sd_scale", 1.0), known.get("offset_mm", 0.0)
+
+
+def _local_spread(found: Fit, mesh: Mesh, by_point: Float[np.ndarray, "v 3"], scale: float) -> LocalSpread | None:
     if found.discrepancy is None:
         return None
-    reach = normal_displacements(np.full((len(by_point), 1), found.discrepancy.slope), by_point)[:, 0]
+    reach = normal_displacements(np.full((len(by_point), 1), scale * found.discrepancy.slope), by_point)[:, 0]
     return LocalSpread(found.discrepancy, found.pose.to_canonical(mesh.vertices), reach)
 
 
 def volume_estimate(mesh: Mesh, spread: SurfaceSpread | None) -> Estimate:
     """Enclosed volume (mL); a vertex that moves out by 1 mm adds its area."""
-    return _estimate(volume_ml(mesh), vertex_areas(mesh) / 1000.0, spread)
+    return estimate_of(volume_ml(mesh), vertex_areas(mesh) / 1000.0, spread)
 
 
 def area_estimate(mesh: Mesh, spread: SurfaceSpread | None) -> Estimate:
     """Surface area (cm^2)."""
-    return _estimate(area_cm2(mesh), np.sum(area_gradient(mesh) * mesh.normals, axis=1) / 100.0, spread)
-
-
-def _estimate(value: float, slope: Float[np.ndarray, "v"], spread: SurfaceSpread | None) -> Estimate:
-    if spread is None:
-        return Estimate(value, None, None)
-    reach = NINETY_PERCENT * spread.sd_of(slope)
-    return Estimate(value, max(0.0, value - reach), value + reach)
+    return estimate_of(area_cm2(mesh), np.sum(area_gradient(mesh) * mesh.normals, axis=1) / 100.0, spread)
 
 
 def occupancy(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndarray, "i j k"]:

@@ -12,18 +12,20 @@ from typing import Any
 import numpy as np
 
 from model.geometry import Grid, Pose
+from model.inference.calipers import Extent
 from model.inference.discrepancy.covariance import Covariance
 from model.inference.discrepancy.process import Discrepancy
+from model.inference.estimates import Estimate
 from model.inference.fitting import Fit, FitStatus
 from model.inference.mesh import Mesh
 from model.inference.observations import Plane
 from model.inference.reconstruction import Options, PlaneResidual, Reconstruction
-from model.inference.uncertainty import Estimate, ShapeState
+from model.inference.uncertainty import ShapeState
 from service.ports import Outcome
 
 SUMMARY, STATE, MESH = "summary.json", "state.npz", "mesh.npz"
 #: Format of the folder; other ones are not read.
-ARCHIVE_VERSION = 1
+ARCHIVE_VERSION = 2
 
 
 def write_outcome(folder: Path, outcome: Outcome, times: Mapping[str, float]) -> None:
@@ -63,10 +65,12 @@ def read_outcome(folder: Path, document: dict[str, Any]) -> Outcome:
         planes=tuple(Plane(**plane) for plane in answer["planes"]),
         observation_count=answer["observation_count"],
         residuals=tuple(
-            PlaneResidual(Plane(**r["plane"]), r["disagreement"], r["mean_error"]) for r in answer["residuals"]
+            PlaneResidual(Plane(**r["plane"]), r["disagreement"], r["mean_error"], r["predictive_p"])
+            for r in answer["residuals"]
         ),
         volume_ml=Estimate(**answer["volume_ml"]),
         area_cm2=Estimate(**answer["area_cm2"]),
+        extents=tuple(map(_extent, answer["extents"])),
         log_prior_density=answer["log_prior_density"],
         typicality_percentile=answer["typicality_percentile"],
         warnings=tuple(answer["warnings"]),
@@ -89,11 +93,17 @@ def _document(outcome: Outcome) -> dict[str, Any]:
             "planes": [_plane(plane) for plane in answer.planes],
             "observation_count": int(answer.observation_count),
             "residuals": [
-                {"plane": _plane(r.plane), "disagreement": float(r.disagreement), "mean_error": float(r.mean_error)}
+                {
+                    "plane": _plane(r.plane),
+                    "disagreement": float(r.disagreement),
+                    "mean_error": float(r.mean_error),
+                    "predictive_p": r.predictive_p,
+                }
                 for r in answer.residuals
             ],
             "volume_ml": _estimate(answer.volume_ml),
             "area_cm2": _estimate(answer.area_cm2),
+            "extents": [{**asdict(extent), "extent_mm": _estimate(extent.extent_mm)} for extent in answer.extents],
             "log_prior_density": float(answer.log_prior_density),
             "typicality_percentile": float(answer.typicality_percentile),
             "warnings": list(answer.warnings),
@@ -109,10 +119,15 @@ def _estimate(estimate: Estimate) -> dict[str, float | None]:
     return {name: None if value is None else float(value) for name, value in asdict(estimate).items()}
 
 
+def _extent(document: dict[str, Any]) -> Extent:
+    x, y, z = document["direction"]
+    return Extent(document["along"], (x, y, z), Estimate(**document["extent_mm"]))
+
+
 def _options(document: dict[str, Any]) -> Options:
     annotated = document["annotated"]
     planes = annotated if isinstance(annotated, str) else tuple(Plane(**plane) for plane in annotated)
-    return Options(**{**document, "annotated": planes})
+    return Options(**{**document, "annotated": planes, "extents": tuple(document["extents"])})
 
 
 def _fit_document(fit: Fit) -> dict[str, Any]:

@@ -112,7 +112,9 @@ def _glb(mesh: Mesh, said: Mapping[str, str]) -> bytes:
         body.vertex_attributes[f"_{name.upper()}"] = values.astype(np.float32)
     body.metadata.update(said)
     if mesh.scalars:
-        body.visual = trimesh.visual.ColorVisuals(body, vertex_colors=colours(next(iter(mesh.scalars.values()))))
+        name, shown = next(iter(mesh.scalars.items()))
+        body.visual = trimesh.visual.ColorVisuals(body, vertex_colors=colours(shown))
+        body.metadata["colours"] = f"{name} from 0 to {float(shown.max()):.4g}"
     scene = trimesh.Scene(base_frame="world")
     scene.add_geometry(body, node_name="surface", geom_name="surface", transform=_to_gltf(said["space"]))
     write: Any = export_glb

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from model.inference.calipers import USUAL_EXTENTS, parse_extents
 from model.inference.reconstruction import Options
 from service.job_files import JobFiles
 from service.job_ports import BlobStore
@@ -42,7 +43,8 @@ def options_of(record: Mapping[str, Any]) -> Options:
     """The choices of a reconstruction request, from a job's argument."""
     annotated = parse_annotated(record["annotated"])
     choices = record["uncertainty"], record["mirror"], record["resolution_mm"], record["seed"]
-    return Options(annotated, *choices, record.get("fidelity"))
+    extents = parse_extents(record["extents"]) if "extents" in record else USUAL_EXTENTS
+    return Options(annotated, *choices, record.get("fidelity"), extents)
 
 
 def labels_of(record: Mapping[str, Any]) -> frozenset[int] | None:

@@ -363,3 +363,71 @@ def test_mean_axes_reconstruct_to_a_typical_shape(client):
     typical = client.post(RECONSTRUCTIONS, files=mask_parts(mask_bytes(MEAN_AXES))).json()
     odd = client.post(RECONSTRUCTIONS, files=mask_parts(mask_bytes((15.5, 6.8, 5.6)))).json()
     assert odd["typicality_percentile"] < typical["typicality_percentile"]
+
+
+def test_extents_are_those_of_the_ellipsoid(summary):
+    found = {extent["along"]: extent for extent in summary["extents"]}
+    assert list(found) == ["R", "A", "S", "longest"]
+    for along, axis in zip("RAS", AXES, strict=True):
+        assert found[along]["extent_mm"]["value"] == pytest.approx(2.0 * axis, rel=0.05)
+    assert found["longest"]["extent_mm"]["value"] == pytest.approx(2.0 * max(AXES), rel=0.05)
+    assert all(e["extent_mm"]["low"] < e["extent_mm"]["value"] < e["extent_mm"]["high"] for e in found.values())
+
+
+def test_extents_are_those_that_were_asked_for(client):
+    data = {"extents": "0 3 4, S", "uncertainty": "none"}
+    found = client.post(RECONSTRUCTIONS, files=mask_parts(), data=data).json()["extents"]
+    assert [extent["along"] for extent in found] == ["0 3 4", "S"]
+    assert found[0]["direction"] == pytest.approx([0.0, 0.6, 0.8])
+    assert found[0]["extent_mm"]["low"] is None
+    refused = problem(client.post(RECONSTRUCTIONS, files=mask_parts(), data={"extents": "up"}), 422)
+    assert refused["part"] == "extents"
+
+
+def test_the_legend_spans_the_colours(summary):
+    legend = summary["surface_sd"]["legend"]
+    assert legend["values_mm"][0] == 0.0
+    assert legend["values_mm"][-1] == summary["surface_sd"]["max_mm"]
+    assert len(legend["colours"]) == len(legend["values_mm"])
+
+
+@pytest.mark.parametrize("planes", ["grid", "free"])
+def test_the_next_plane_is_one_that_was_not_drawn_and_gains(client, summary, planes):
+    found = client.get(summary["links"]["next_plane"], params={"planes": planes}).json()
+    assert (found["space"], found["unit"]) == ("RAS", "mm")
+    assert found["plane"] not in summary["planes"]
+    assert (found["plane"] is None) == (planes == "free")
+    assert found["surface_sd_mm"]["now"] == pytest.approx(summary["surface_sd"]["mean_mm"])
+    for gain in (found["surface_sd_mm"], found["volume_sd_ml"]):
+        assert 0.0 < gain["expected"] < gain["now"]
+    ellipsoid, _ = truth()
+    assert np.abs(np.array(found["origin_mm"]) - ellipsoid.centre).max() < max(AXES)
+
+
+@pytest.mark.parametrize("format", ["ply", "stl"])
+def test_posterior_shapes_spread_about_the_answer(client, summary, format):
+    query = {"count": 6, "seed": 3, "format": format, "spacing_mm": 1.5}
+    answer = client.get(summary["links"]["posterior"], params=query)
+    archive = zipfile.ZipFile(io.BytesIO(answer.content))
+    manifest = json.loads(archive.read("manifest.json"))
+    assert archive.namelist() == [*(entry["file"] for entry in manifest["samples"]), "manifest.json"]
+    volumes = [entry["volume_ml"] for entry in manifest["samples"]]
+    for entry in manifest["samples"]:
+        mesh = trimesh.load(io.BytesIO(archive.read(entry["file"])), file_type=format)
+        assert abs(mesh.volume) / 1000.0 == pytest.approx(entry["volume_ml"], rel=1e-3)
+    value = summary["volume_ml"]
+    assert 0.0 < np.std(volumes) < value["high"] - value["low"]
+    assert np.mean(volumes) == pytest.approx(value["value"], rel=0.1)
+    assert client.get(summary["links"]["posterior"], params={**query, "count": 1, "seed": 5}).status_code == 200
+
+
+def test_posterior_and_next_plane_need_uncertainty(client):
+    links = client.post(RECONSTRUCTIONS, files=mask_parts(), data={"uncertainty": "none"}).json()["links"]
+    assert links["posterior"] is None
+    assert links["next_plane"] is None
+    for part in ("posterior", "next-plane"):
+        assert problem(client.get(f"{links['self']}/{part}"), 404)["type"].endswith("not-computed")
+
+
+def test_too_many_posterior_shapes_are_refused(client, summary):
+    assert problem(client.get(summary["links"]["posterior"], params={"count": 10**6}), 413)["part"] == "count"

@@ -93,6 +93,22 @@ class Covariance:
                 total[row] += (y[:, near] * along[near]) @ z[:, near].T
         return total
 
+    def drawn_on(self, axes: Axes, random: np.random.Generator) -> Float[np.ndarray, "i j k"]:
+        """A draw of the process (mm) at the nodes of a lattice: on each axis a root of the term's covariance."""
+        total = np.zeros(tuple(len(axis) for axis in axes), np.float32)
+        for sd, length in zip(self.sds, self.lengths, strict=True):
+            field = random.standard_normal(total.shape).astype(np.float32)
+            for axis in reversed(axes):
+                field = np.tensordot(_root(_falls(axis, axis, length)), field, (1, 2))
+            total += np.float32(sd) * field
+        return total
+
+
+def _root(covariance: Float[np.ndarray, "i i"]) -> Float[np.ndarray, "i i"]:
+    """``R`` with ``R R^T`` the covariance, which may be singular to rounding."""
+    values, vectors = np.linalg.eigh(covariance.astype(float))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)), np.float32)
+
 
 def _falls(axis: Float[np.ndarray, "i"], coordinate: Float[np.ndarray, "m"], length: float) -> Float[np.ndarray, "i m"]:
     return np.asarray(np.exp(-0.5 * np.square((axis[:, None] - coordinate) / length)), np.float32)

@@ -116,6 +116,11 @@ class Discrepancy:
             result[piece] = self.covariance.between(canonical[piece], self.points) @ self._moves
         return result
 
+    def whitened(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "n m"]:
+        """``W`` with ``k(a, b) - W_a^T W_b`` the posterior covariance (mm^2) between points."""
+        seen = self.covariance.between(self.points, canonical)
+        return np.asarray(solve_triangular(self._factor[0].astype(np.float32), seen, lower=True))
+
     def functional_variance(self, canonical: Float[np.ndarray, "m 3"], weights: Float[np.ndarray, "m"]) -> float:
         """Posterior variance of ``sum_m weights_m delta(u_m)`` (square of the weights' unit times mm^2).
 

@@ -4,7 +4,7 @@ import highdicom as hd
 from pydicom.sr.codedict import codes
 from pydicom.sr.coding import Code
 
-from model.inference.uncertainty import Estimate
+from model.inference.estimates import Estimate
 from service.adapters.dicom.derivation import DISCLAIMER, MANUFACTURER, Derivation
 
 #: Scheme of the concepts that no standard vocabulary has.

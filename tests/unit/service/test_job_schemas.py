@@ -21,6 +21,7 @@ CHOICES = st.fixed_dictionaries(
         "resolution_mm": st.none() | st.floats(0.25, 10.0),
         "seed": st.integers(0, 1000),
         "fidelity": st.none() | st.floats(0.0, 1.0),
+        "extents": st.sampled_from(["R, A", "longest", "1 0 0.5,S"]),
     }
 )
 

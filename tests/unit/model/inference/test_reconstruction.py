@@ -13,12 +13,12 @@ from model.inference.mesh import area_cm2, is_watertight, volume_ml
 from model.inference.observations import MaskStack, Plane, section_of
 from model.inference.posterior import fitted_jacobians
 from model.inference.reconstruction import (
-    ATYPICAL_PERCENTILE,
     OBSERVATION_BUDGET,
     Options,
     reconstruct,
-    typicality,
 )
+from model.inference.reliability import Figures
+from model.inference.typicality import ATYPICAL_BY_DENSITY, typicality
 from tests.analytic_model import EllipsoidDecoder, bent_model, ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import ORTHOGONAL, PARALLEL, DecodedShape, cube_around, drawn, rotation
@@ -236,7 +236,7 @@ def test_the_wrong_slice_among_five_is_named(wrong):
 def test_a_shape_unlike_the_population_is_warned_of(axes):
     ellipsoid = Ellipsoid(axes, CENTRE)
     answer = reconstructed(drawn(ellipsoid, cube_around(CENTRE, step=1.5)), annotated=ORTHOGONAL)
-    assert answer.typicality_percentile < ATYPICAL_PERCENTILE
+    assert answer.typicality_percentile < ATYPICAL_BY_DENSITY
     assert any("unlike the population" in sentence for sentence in answer.warnings)
 
 
@@ -251,11 +251,11 @@ def test_typicality_is_the_share_of_the_population_below():
     found = reconstructed(drawn(ELLIPSOID, cube_around(CENTRE)), uncertainty="none").state.fits[0]
     percentiles = []
     for code in MODEL.population.codes:
-        density, percentile = typicality(MODEL, replace(found, latent=code))
+        density, percentile = typicality(MODEL, replace(found, latent=code), Figures(3, 0.3, 0.3))
         assert density == pytest.approx(-0.5 * code @ code - 1.5 * np.log(2 * np.pi))
         percentiles.append(percentile)
     assert sorted(percentiles) == pytest.approx(100.0 * np.arange(64) / 64)
-    assert typicality(MODEL, replace(found, latent=np.zeros(3)))[1] == 100.0
+    assert typicality(MODEL, replace(found, latent=np.zeros(3)), Figures(3, 0.3, 0.3))[1] == 100.0
 
 
 def test_empty_planes_that_stay_empty_agree():

@@ -26,7 +26,7 @@ from tests.drawn_shapes import cube_around, rotation
 from training.cohorts.cohort import Case
 from training.perturb import cut_off, noisy, parallel, sections_of, with_wrong
 from training.sparsify import for_evaluation
-from training.usual import sound_drawings, usual_figures
+from training.usual import sound_answers, sound_drawings, usual_figures
 
 CENTRE = np.array([30.0, -20.0, 50.0])
 GRID = cube_around(CENTRE, nodes=37)
@@ -35,7 +35,7 @@ CASES = [
     for name, axes in (("long", (14.5, 8.5, 7.5)), ("short", (11.5, 9.5, 7.0)))
 ]
 PLAIN = ellipsoid_model()
-USUAL = usual_figures(PLAIN, CASES)
+USUAL = usual_figures(sound_answers(PLAIN, CASES))
 MODEL = replace(PLAIN, manifest=replace(PLAIN.manifest, usual=USUAL))
 FIVE = parallel(CASES[0].mask, GRID)
 

@@ -9,8 +9,17 @@ from hypothesis import strategies as st
 from scipy.special import expit
 
 from model.geometry import POSE_SIZE, Grid, Pose
+from model.inference.estimates import Estimate, interval_reach
 from model.inference.fitting import Fit, FitOptions, FitStatus, fit
-from model.inference.mesh import Mesh, area_cm2, area_gradient, empty_mesh, vertex_normals, volume_ml
+from model.inference.mesh import (
+    Mesh,
+    area_cm2,
+    area_gradient,
+    empty_mesh,
+    vertex_areas,
+    vertex_normals,
+    volume_ml,
+)
 from model.inference.posterior import (
     fitted_jacobians,
     laplace_covariance,
@@ -20,8 +29,6 @@ from model.inference.posterior import (
 )
 from model.inference.surface import canonical_box, surface_of
 from model.inference.uncertainty import (
-    NINETY_PERCENT,
-    Estimate,
     ShapeState,
     area_estimate,
     occupancy,
@@ -77,7 +84,7 @@ def test_intervals_are_those_of_draws_from_the_posterior(covariance):
         (volume_estimate(MESH, spread), [shape.volume_ml for shape in shapes]),
         (area_estimate(MESH, spread), [shape.area_cm2 for shape in shapes]),
     ):
-        assert half_width(estimate) == pytest.approx(NINETY_PERCENT * np.std(drawn_figures), rel=0.06)
+        assert half_width(estimate) == pytest.approx(interval_reach(0.9) * np.std(drawn_figures), rel=0.06)
         low, high = np.quantile(drawn_figures, [0.05, 0.95])
         assert (estimate.low, estimate.high) == pytest.approx((low, high), rel=0.02)
 
@@ -89,7 +96,7 @@ def test_intervals_are_those_of_meshes_of_draws():
     meshes = [surface_of(MODEL, each.latent, each.pose, 1.5) for each in fits]
     for estimate, figure in ((volume_estimate(MESH, spread), volume_ml), (area_estimate(MESH, spread), area_cm2)):
         drawn_sd = np.std([figure(mesh) for mesh in meshes])
-        assert half_width(estimate) == pytest.approx(NINETY_PERCENT * drawn_sd, rel=0.15)
+        assert half_width(estimate) == pytest.approx(interval_reach(0.9) * drawn_sd, rel=0.15)
 
 
 def test_surface_spread_of_each_parameter():
@@ -129,7 +136,7 @@ def test_ensemble_interval_is_that_of_its_volumes():
     members = tuple(moved(step) for step in steps)
     spread = surface_spread(MODEL, ShapeState((FIT, *members), None), MESH)
     of_members = np.std([ellipsoid_of(member).volume_ml for member in members], ddof=1)
-    assert half_width(volume_estimate(MESH, spread)) == pytest.approx(NINETY_PERCENT * of_members, rel=0.1)
+    assert half_width(volume_estimate(MESH, spread)) == pytest.approx(interval_reach(0.9) * of_members, rel=0.1)
 
 
 def test_no_intervals_without_uncertainty():
@@ -258,3 +265,14 @@ def test_uncertainty_is_greatest_between_drawn_planes():
     sd = surface_spread(MODEL, ShapeState((found,), laplace_covariance(found)), mesh).sd()
     drawn_side = mesh.vertices[:, 2] < CENTRE[2]
     assert sd[~drawn_side].max() > 1.5 * sd[drawn_side].max()
+
+
+def test_calibrated_spread_is_wider_and_shares_an_offset():
+    state = ShapeState((FIT,), covariance_of(latent=0.2, position=1.0))
+    calibrated = replace(MODEL, manifest=replace(MODEL.manifest, posterior={"sd_scale": 1.5, "offset_mm": 0.3}))
+    plain, wide = (surface_spread(model, state, MESH) for model in (MODEL, calibrated))
+    np.testing.assert_allclose(wide.sd() ** 2, 2.25 * plain.sd() ** 2 + 0.09, rtol=1e-6)
+    # An error that the surface shares moves its volume by its area, whatever else cancels.
+    areas = vertex_areas(MESH)
+    expected = np.hypot(1.5 * plain.sd_of(areas), 0.3 * areas.sum())
+    assert wide.sd_of(areas) == pytest.approx(expected, rel=1e-6)

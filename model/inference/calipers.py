@@ -1,0 +1,124 @@
+"""Extents of a surface: its width between two parallel planes (caliper diameter), and its longest diameter.
+
+To first order an extent grows by as much as the surface moves out at the two vertices that decide it, along the line
+between them.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import pdist, squareform
+
+from model.errors import InvalidParameter
+from model.inference.estimates import Estimate, estimate_of
+from model.inference.mesh import Mesh
+from model.inference.spread import SurfaceSpread
+
+#: World directions with a name; ``longest`` is the largest distance between two points of the surface.
+AXES = {"R": (1.0, 0.0, 0.0), "A": (0.0, 1.0, 0.0), "S": (0.0, 0.0, 1.0)}
+LONGEST = "longest"
+#: What is measured when nobody chooses.
+USUAL_EXTENTS = (*AXES, LONGEST)
+#: The same as a text.
+USUAL_TEXT = ", ".join(USUAL_EXTENTS)
+#: Extents that may be asked for together, at most.
+MOST_EXTENTS = 32
+#: A hull with more corners than this is thinned out before all distances between them are taken.
+MOST_CORNERS = 2000
+
+_NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
+_DIRECTION = re.compile(rf"{_NUMBER}(\s+{_NUMBER}){{2}}\Z")
+
+
+@dataclass(frozen=True)
+class Extent:
+    """One extent.
+
+    Attributes:
+        along: as it was asked for: ``R``, ``A``, ``S``, ``longest``, or three numbers.
+        direction: unit vector in the world (RAS).
+        extent_mm: with its interval.
+    """
+
+    along: str
+    direction: tuple[float, float, float]
+    extent_mm: Estimate
+
+
+def parse_extents(text: str) -> tuple[str, ...]:
+    """Names and directions separated by commas, each once: ``R, longest, 0.5 0 0.87``.
+
+    Raises:
+        InvalidParameter: something else, or too many.
+    """
+    words = list(dict.fromkeys(" ".join(word.split()) for word in text.split(",") if word.strip()))
+    for word in words:
+        direction_of(word)
+    if len(words) > MOST_EXTENTS:
+        raise InvalidParameter(f"extents names {len(words)}; at most {MOST_EXTENTS} are accepted.", part="extents")
+    return tuple(words)
+
+
+def direction_of(along: str) -> Float[np.ndarray, "3"] | None:
+    """Unit direction (RAS) of a word, None for the longest diameter.
+
+    Raises:
+        InvalidParameter: neither a name nor three numbers, not all of them zero.
+    """
+    if along == LONGEST:
+        return None
+    if along in AXES:
+        return np.array(AXES[along])
+    if _DIRECTION.match(along):
+        vector = np.array([float(number) for number in along.split()])
+        with np.errstate(over="ignore"):
+            length = float(np.linalg.norm(vector))
+        if 0.0 < length < np.inf:
+            return vector / length
+    raise InvalidParameter(
+        f"extents must hold R, A, S, {LONGEST} or three numbers with blanks between them that are not all zero, "
+        "such as 0.5 0 0.87.",
+        part="extents",
+    )
+
+
+def measure_extents(mesh: Mesh, spread: SurfaceSpread | None, extents: Sequence[str]) -> tuple[Extent, ...]:
+    """Extents of a surface in the order in which they were asked for, with 90 % intervals."""
+    return tuple(_measure(mesh, spread, along) for along in extents)
+
+
+def _measure(mesh: Mesh, spread: SurfaceSpread | None, along: str) -> Extent:
+    direction = direction_of(along)
+    low, high = _farthest(mesh) if direction is None else _ends(mesh, direction)
+    if direction is None:
+        direction = mesh.vertices[high] - mesh.vertices[low]
+        direction = direction / max(float(np.linalg.norm(direction)), 1e-9)
+    slope = np.zeros(len(mesh.vertices))
+    slope[high] += float(mesh.normals[high] @ direction)
+    slope[low] -= float(mesh.normals[low] @ direction)
+    value = float((mesh.vertices[high] - mesh.vertices[low]) @ direction)
+    x, y, z = direction.tolist()
+    return Extent(along, (x, y, z), estimate_of(value, slope, spread))
+
+
+def _ends(mesh: Mesh, direction: Float[np.ndarray, "3"]) -> tuple[int, int]:
+    places = mesh.vertices @ direction
+    return int(np.argmin(places)), int(np.argmax(places))
+
+
+def _farthest(mesh: Mesh) -> tuple[int, int]:
+    try:
+        corners = ConvexHull(mesh.vertices).vertices
+    except QhullError:  # a surface without volume
+        corners = np.arange(len(mesh.vertices))
+    corners = corners[:: -(-len(corners) // MOST_CORNERS)]
+    gaps = squareform(pdist(mesh.vertices[corners]))
+    first, second = np.unravel_index(int(np.argmax(gaps)), gaps.shape)
+    # From low to high along the axis in which they differ most, so that the direction does not depend on the order.
+    a, b = int(corners[first]), int(corners[second])
+    step = mesh.vertices[b] - mesh.vertices[a]
+    return (a, b) if step[np.argmax(np.abs(step))] >= 0 else (b, a)

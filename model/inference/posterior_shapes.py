@@ -1,0 +1,78 @@
+"""Shapes drawn from the posterior of one reconstruction: code, pose and discrepancy together.
+
+A draw of code and pose comes from the Laplace posterior; the contours then hold the surface as they hold the fit's, so
+the discrepancy is observed anew at them and a draw of it added. An ensemble's draws are its members.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from model.bundle import ShapeModel
+from model.geometry import Pose
+from model.inference.discrepancy.draws import drawn
+from model.inference.discrepancy.process import REACH_MM, Discrepancy
+from model.inference.fitting import Fit
+from model.inference.mesh import Mesh
+from model.inference.surface import surface_of
+from model.inference.uncertainty import ShapeState, calibrated_scale
+
+
+@dataclass(frozen=True)
+class PosteriorShape:
+    """One draw.
+
+    Attributes:
+        fit: code, pose and discrepancy.
+        mesh: its surface, world RAS mm; empty where the draw has none.
+    """
+
+    fit: Fit
+    mesh: Mesh
+
+
+def draw_posterior(model: ShapeModel, state: ShapeState, seed: int, step_mm: float | None = None) -> PosteriorShape:
+    """One draw, a pure function of its arguments.
+
+    Args:
+        state: of a reconstruction with uncertainty.
+        seed: non-negative.
+        step_mm: grid step of the surface; the model's own when None.
+    """
+    chosen = _member(state, seed) if state.members else _around(model, state, seed)
+    return PosteriorShape(chosen, surface_of(model, chosen.latent, chosen.pose, step_mm, chosen.discrepancy))
+
+
+def _member(state: ShapeState, seed: int) -> Fit:
+    """Members in a random order, each once before any comes again."""
+    count = len(state.members)
+    order = np.random.default_rng(seed // count).permutation(count)
+    return state.members[int(order[seed % count])]
+
+
+def _around(model: ShapeModel, state: ShapeState, seed: int) -> Fit:
+    if state.covariance is None:
+        raise ValueError("a state without uncertainty has no posterior to draw from")
+    found, random = state.fits[0], np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(state.covariance)
+    scale, offset = calibrated_scale(model)
+    step = scale * vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
+    latent, pose = found.latent + step[:-7], found.pose.moved(step[-7:])
+    if found.discrepancy is None:
+        return replace(found, latent=latent, pose=pose)
+    held = _observed_anew(model, found, found.discrepancy, latent, pose)
+    shift = offset * float(random.standard_normal())
+    return replace(found, latent=latent, pose=pose, discrepancy=drawn(held, int(random.integers(2**32)), scale, shift))
+
+
+def _observed_anew(
+    model: ShapeModel, found: Fit, discrepancy: Discrepancy, latent: Float[np.ndarray, "d"], pose: Pose
+) -> Discrepancy:
+    """The discrepancy at the same contours, seen from another code and pose."""
+    world = found.pose.to_world(discrepancy.points)
+    moved = pose.to_canonical(world)
+    scale = REACH_MM * discrepancy.slope
+    before = np.tanh(model.decoder.logits(found.latent[None], discrepancy.points[None])[0] / scale)
+    after = np.tanh(model.decoder.logits(latent[None], moved[None])[0] / scale)
+    return replace(discrepancy, points=moved, residuals=discrepancy.residuals + REACH_MM * (before - after))

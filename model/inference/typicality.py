@@ -1,0 +1,87 @@
+"""How like the population a shape is, as far as the model can tell: its code's density, and how well it was fitted.
+
+A shape of another kind either needs a code that the prior holds for unlikely, or is one that no code expresses, so
+that the contours stay far from it. Both are held against what answers to sound drawings of real shapes look like
+(`Manifest.typical`): the code of a sparse drawing is drawn towards the middle of the population, and has another
+density than one that was trained on a dense mask. A figure that is worse than usual by ``z`` SDs has the tail
+probability of Student's distribution, the predictive one for estimates from few shapes; the less probable one counts,
+doubled because two were looked at.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.stats import t as student
+
+from model.bundle import ShapeModel
+from model.inference.agreement import Section
+from model.inference.fitting import Fit
+from model.inference.mask_stack import Plane
+from model.inference.reliability import USUAL_PLANES, Figures
+
+#: Below this percentile a shape is called unlike the population; below the other when it is by the density alone.
+ATYPICAL_PERCENTILE, ATYPICAL_BY_DENSITY = 0.1, 1.0
+#: A slice is told of when sound drawings would disagree as much with so small a probability.
+SURPRISING = 1e-3
+
+
+def typicality(model: ShapeModel, found: Fit, figures: Figures) -> tuple[float, float]:
+    """Log prior density of the fitted code (nats), and the percentile of the shape among real ones.
+
+    Args:
+        figures: of the fit; a misfit of 0 is one that was not looked at.
+    """
+    density = float(model.prior.log_density(found.latent[None])[0][0])
+    known = model.manifest.typical
+    if not known:
+        return density, float(100.0 * np.mean(model.population.log_densities < density))
+    tails = [_tail(known, (known["density_mean"] - density) / known["density_sd"])]
+    if figures.misfit_mm > 0.0:
+        usual = known["misfit_mean"] + known["misfit_exponent"] * np.log(figures.planes / USUAL_PLANES)
+        tails.append(_tail(known, (np.log(figures.misfit_mm) - usual) / known["misfit_sd"]))
+    return density, 100.0 * min(1.0, len(tails) * min(tails))
+
+
+def typicality_warnings(model: ShapeModel, percentile: float) -> tuple[str, ...]:
+    """What to tell about a shape that the model does not know."""
+    limit = ATYPICAL_PERCENTILE if model.manifest.typical else ATYPICAL_BY_DENSITY
+    if percentile >= limit:
+        return ()
+    return ("The shape is unlike the population that the model was trained on; do not rely on it.",)
+
+
+def predictive_probabilities(model: ShapeModel, sections: Sequence[Section]) -> list[float | None]:
+    """For each plane, how probable it is that a sound drawing disagrees with its reconstruction at least as much.
+
+    A posterior predictive check (Gelman, Meng and Stern 1996) of the cross-entropy of the labels relative to that of
+    labels drawn from the field. Labels are not independent, so its distribution is that over sound drawings. None
+    where the model does not know it.
+    """
+    known = model.manifest.typical
+    if not known:
+        return [None for _ in sections]
+    return [_tail(known, (section.surprise - known["slice_mean"]) / known["slice_sd"]) for section in sections]
+
+
+def predictive_warnings(
+    sections: Sequence[Section], probabilities: Sequence[float | None], named: Sequence[Plane]
+) -> tuple[str, ...]:
+    """What to tell about planes whose drawing no draw from the posterior looks like, less those named elsewhere."""
+    pairs = zip(sections, probabilities, strict=True)
+    planes = [
+        section.plane
+        for section, value in pairs
+        if value is not None and value < SURPRISING and section.trusted and section.plane not in named
+    ]
+    if not planes:
+        return ()
+    names = ", ".join(f"mask[{plane.stack}] axis {plane.axis} index {plane.index}" for plane in planes)
+    sentence = (
+        f"The drawing on {names} is not what the reconstruction would predict there, less so than in 999 of 1000 sound "
+        "drawings: it contradicts the others, or the shape is unlike the population."
+    )
+    return (sentence,)
+
+
+def _tail(known: Mapping[str, float], z: float) -> float:
+    return float(student.sf(z, known["freedom"]))

@@ -1,0 +1,65 @@
+"""Shapes from the posterior of a reconstruction as files, and the manifest that goes with them."""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from model.inference.mesh import area_cm2, volume_ml
+from model.inference.posterior_shapes import PosteriorShape
+from service.adapters.sample_files import SampleFile
+from service.ports import MeshFormat, MeshWriter
+from service.use_cases import Posterior
+
+
+class PosteriorWriter:
+    """Draws shapes and writes them in a mesh format."""
+
+    def __init__(self, write_mesh: MeshWriter, format: MeshFormat) -> None:
+        self._write_mesh = write_mesh
+        self._format = format
+
+    def make(self, posterior: Posterior, seed: int) -> SampleFile:
+        """The shape of a seed; the same arguments give the same bytes.
+
+        A draw without any surface is an entry without a file, and has no bytes.
+        """
+        shape = posterior.draw(seed)
+        if shape.mesh.is_empty:
+            return SampleFile("", b"", {"file": None, **_entry(shape, seed)})
+        name = f"posterior-{seed}.{self._format.value}"
+        said = {**_model(posterior), "seed": seed}
+        data = self._write_mesh(shape.mesh, self._format.value, space="RAS", metadata=said)
+        return SampleFile(name, data, {"file": name, **_entry(shape, seed)})
+
+    def manifest(self, posterior: Posterior, identifier: str, entries: Sequence[dict[str, Any]]) -> bytes:
+        """``manifest.json`` of a batch."""
+        document = {
+            "model": _model(posterior),
+            "reconstruction": identifier,
+            "uncertainty": posterior.outcome.options.uncertainty,
+            "space": "RAS",
+            "unit": "mm",
+            "format": self._format.value,
+            "spacing_mm": posterior.spacing_mm or posterior.model.manifest.resolution_mm,
+            "samples": list(entries),
+        }
+        return json.dumps(document, indent=1).encode()
+
+
+def _model(posterior: Posterior) -> dict[str, object]:
+    outcome = posterior.outcome
+    return {"name": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest}
+
+
+def _entry(shape: PosteriorShape, seed: int) -> dict[str, Any]:
+    mesh = shape.mesh
+    lower, upper = (mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) if len(mesh.vertices) else (np.zeros(3),) * 2
+    return {
+        "seed": seed,
+        "volume_ml": volume_ml(mesh),
+        "area_cm2": area_cm2(mesh),
+        "extent_mm": (upper - lower).tolist(),
+        "latent": shape.fit.latent.tolist(),
+    }

@@ -1,0 +1,102 @@
+"""What is said of shapes that are unlike those that a model knows, and of slices that contradict the others."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.inference.agreement import Section, sections_of
+from model.inference.fitting import FitOptions, fit
+from model.inference.observations import Plane
+from model.inference.posterior import fitted_logits
+from model.inference.reliability import Figures
+from model.inference.typicality import (
+    predictive_probabilities,
+    predictive_warnings,
+    typicality,
+    typicality_warnings,
+)
+from tests.analytic_model import ellipsoid_model
+from tests.analytic_shapes import Ellipsoid
+from tests.drawn_shapes import cube_around, drawn, observed
+
+CENTRE = np.array([30.0, -20.0, 50.0])
+KNOWN = {
+    "freedom": 15.0,
+    "misfit_exponent": 0.1,
+    "misfit_mean": -1.0,
+    "misfit_sd": 0.2,
+    "density_mean": -4.0,
+    "density_sd": 1.0,
+    "slice_mean": 0.0,
+    "slice_sd": 0.2,
+}
+PLAIN = ellipsoid_model()
+MODEL = replace(PLAIN, manifest=replace(PLAIN.manifest, typical=KNOWN))
+OBSERVATIONS = observed(drawn(Ellipsoid((14.0, 9.0, 6.0), CENTRE), cube_around(CENTRE)))
+FOUND = fit(PLAIN, OBSERVATIONS, FitOptions())
+USUAL = float(np.exp(-1.0))
+spreads = st.floats(0.02, 20.0)
+
+
+def percentile(misfit, planes=5, latent=(0.0, 0.0, 0.0)):
+    return typicality(MODEL, replace(FOUND, latent=np.array(latent)), Figures(planes, misfit, 0.3))[1]
+
+
+def section(surprise, index=0, trusted=True):
+    return Section(Plane(0, 2, index), 50.0, 50.0, 45.0, 0.0, surprise, trusted)
+
+
+@given(spreads, spreads)
+def test_the_farther_the_contours_the_less_typical(first, second):
+    near, far = sorted((first, second))
+    assert 0.0 <= percentile(far) <= percentile(near) <= 100.0
+
+
+@given(st.floats(0.0, 6.0), st.floats(0.0, 6.0))
+def test_the_less_dense_the_code_the_less_typical(first, second):
+    near, far = sorted((first, second))
+    codes = [distance * np.array([1.0, 0.0, 0.0]) for distance in (near, far)]
+    assert percentile(USUAL, latent=codes[1]) <= percentile(USUAL, latent=codes[0])
+
+
+def test_a_usual_shape_is_typical_with_any_number_of_planes():
+    for planes in (2, 5, 20):
+        usual = USUAL * (planes / 5.0) ** 0.1
+        assert percentile(usual, planes) > 20.0
+        assert typicality_warnings(MODEL, percentile(6.0 * usual, planes)) != ()
+        assert typicality_warnings(MODEL, percentile(1.5 * usual, planes)) == ()
+
+
+def test_a_misfit_that_was_not_looked_at_does_not_count():
+    assert percentile(0.0, latent=np.zeros(3)) > 40.0
+    assert typicality_warnings(MODEL, percentile(0.0, latent=np.array([6.0, 0.0, 0.0]))) != ()
+
+
+def test_a_plane_that_surprises_is_told_of_unless_it_is_named_elsewhere():
+    sections = [section(0.1, 1), section(3.0, 2), section(3.0, 3, trusted=False), section(3.0, 4)]
+    chances = predictive_probabilities(MODEL, sections)
+    assert chances[0] > 0.1
+    assert all(chance < 1e-6 for chance in chances[1:])
+    (sentence,) = predictive_warnings(sections, chances, [Plane(0, 2, 4)])
+    assert "mask[0] axis 2 index 2" in sentence
+    assert "index 3" not in sentence
+    assert "index 4" not in sentence
+
+
+def test_a_model_that_was_not_calibrated_does_not_judge_slices():
+    sections = [section(3.0)]
+    assert predictive_probabilities(PLAIN, sections) == [None]
+    assert predictive_warnings(sections, [None], []) == ()
+
+
+@pytest.mark.parametrize("shift", [0.0, 3.0])
+def test_labels_drawn_from_the_field_surprise_as_little_as_expected(shift):
+    logits = fitted_logits(PLAIN, FOUND, OBSERVATIONS.points + np.array([shift, 0.0, 0.0]))
+    random = np.random.default_rng(0).random(len(logits))
+    true = fitted_logits(PLAIN, FOUND, OBSERVATIONS.points)
+    labelled = replace(OBSERVATIONS, labels=(random < 1.0 / (1.0 + np.exp(-true))).astype(float))
+    surprises = [one.surprise for one in sections_of(labelled, logits)]
+    assert (max(np.abs(surprises)) < 0.5) == (shift == 0.0)
