@@ -55,8 +55,9 @@ def surface_spread(model: ShapeModel, state: ShapeState, mesh: Mesh) -> SurfaceS
         _, by_parameter, by_point = fitted_jacobians(model, found, mesh.vertices)
         scale, offset = calibrated_scale(model)
         factors = scale * normal_displacements(by_parameter, by_point) @ np.linalg.cholesky(state.covariance)
-        shared = np.full((len(factors), 1), offset)
-        return SurfaceSpread(np.hstack([factors, shared]), _local_spread(found, mesh, by_point, scale))
+        if offset > 0.0:
+            factors = np.hstack([factors, np.full((len(factors), 1), offset)])
+        return SurfaceSpread(factors, _local_spread(found, mesh, by_point, scale))
     if state.members:
         _, _, by_point = fitted_jacobians(model, found, mesh.vertices)
         logits = np.stack([fitted_logits(model, member, mesh.vertices) for member in state.members], axis=1)
