@@ -11,7 +11,8 @@
     │   ├── InvalidParameter       a value out of its range
     │   └── TooLarge               over a configured limit
     ├── NotFound                   `what` is not here
-    │   └── UnknownModel
+    │   ├── UnknownModel
+    │   └── UnknownMode            no mode of this rank
     ├── BundleError                an exported model that cannot be trusted
     │   ├── BundleIncomplete       a file is missing
     │   ├── BundleCorrupt          a file differs from its recorded SHA-256, or cannot be parsed
@@ -72,6 +73,10 @@ class NotFound(MorphoFlowError):
 
 class UnknownModel(NotFound):
     """No loaded model carries this name."""
+
+
+class UnknownMode(NotFound):
+    """The model has no mode of this rank."""
 
 
 class BundleError(MorphoFlowError):

@@ -13,8 +13,10 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 from fastapi_offline import FastAPIOffline
 
+from model.inference.modes import shape_modes
 from service.adapters.images import ImageLimits, read_masks, write_nifti
 from service.adapters.mesh_formats import write_mesh
+from service.adapters.per_model import PerModel
 from service.adapters.workers import WorkerPool
 from service.model_registry import ModelRegistry, load_registry
 from service.observability import Log, Metrics, make_log
@@ -24,6 +26,7 @@ from service.routes.dependencies import Services
 from service.routes.jobs import jobs_router
 from service.routes.middleware import AccessMiddleware, BodyLimitMiddleware, KeyMiddleware
 from service.routes.models import models_router
+from service.routes.modes import modes_router
 from service.routes.operations import operations_router
 from service.routes.page import page_router
 from service.routes.planes import planes_router
@@ -65,6 +68,7 @@ def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log
         read_mask=mask_reader(settings),
         write_mesh=write_mesh,
         write_volume=write_nifti,
+        modes=PerModel(shape_modes),
         jobs=jobs,
         blobs=blobs,
         metrics=Metrics(engine, jobs),
@@ -137,6 +141,7 @@ def _add_routes(app: FastAPI) -> None:
         planes_router,
         posterior_router,
         models_router,
+        modes_router,
         samples_router,
         jobs_router,
         stow_router,

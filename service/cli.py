@@ -1,4 +1,4 @@
-"""The command line: ``morphoflow serve | reconstruct | sample | models | openapi``, and commands of other packages.
+"""The command line: ``morphoflow serve | reconstruct | sample | models | modes``, and commands of other packages.
 
 Exit status: 0 done, 2 the input is at fault (one sentence on standard error), 1 a fault of the program.
 """
@@ -20,6 +20,7 @@ from service.commands import OpenRegistry, models, reconstruct, sample
 from service.dicom_commands import audit, deidentify
 from service.job_commands import jobs_commands
 from service.jobs.worker import run_worker, supervised_workers
+from service.mode_commands import modes
 from service.model_registry import load_registry
 from service.observability import uvicorn_logging
 from service.settings import Settings, load_settings, require_protection
@@ -70,7 +71,7 @@ def build_app() -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback(invoke_without_command=True)(_program)
-    for command in (serve, worker, reconstruct, sample, models, deidentify, audit, openapi):
+    for command in (serve, worker, reconstruct, sample, models, modes, deidentify, audit, openapi):
         app.command()(command)
     app.add_typer(jobs_commands(), name="jobs")
     return app

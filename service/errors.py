@@ -37,6 +37,7 @@ from model.errors import (
     NotFound,
     ParityError,
     TooLarge,
+    UnknownMode,
     UnknownModel,
     UnreadableImage,
 )
@@ -123,6 +124,7 @@ KINDS: dict[type[MorphoFlowError], Kind] = {
     TooLarge: Kind(413, "too-large", "Larger than the limit"),
     NotFound: Kind(404, "not-found", "Not found"),
     UnknownModel: Kind(404, "unknown-model", "Unknown model"),
+    UnknownMode: Kind(404, "unknown-mode", "Unknown mode"),
     UnknownResult: Kind(404, "unknown-result", "Unknown result"),
     UnknownJob: Kind(404, "unknown-job", "Unknown job"),
     NotComputed: Kind(404, "not-computed", "Not part of this result"),

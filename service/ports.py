@@ -14,6 +14,7 @@ from jaxtyping import Shaped
 from model.bundle import ShapeModel
 from model.geometry import Grid
 from model.inference.mesh import Mesh
+from model.inference.modes import ShapeModes
 from model.inference.observations import MaskStack
 from model.inference.reconstruction import Options, Reconstruction
 
@@ -153,6 +154,14 @@ class Ticket(Protocol):
 
     async def run(self, work: Callable[[], T]) -> T:
         """Result of the work, done by one of the engine's workers."""
+        ...
+
+
+class ModeSource(Protocol):
+    """Modes of a model, found once."""
+
+    def __call__(self, model: ShapeModel, /) -> ShapeModes:
+        """The same model gives the same modes."""
         ...
 
 

@@ -1,6 +1,6 @@
 """What the service can do, as plain functions of domain types: no HTTP, no settings, no clock."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from model.geometry import Grid, Pose
 from model.inference.comparison import compared
 from model.inference.fitting import Fit, FitStatus
 from model.inference.mesh import Mesh
+from model.inference.modes import ShapeModes, shape_along
 from model.inference.next_plane import Among, NextPlane
 from model.inference.next_plane import next_plane as best_plane
 from model.inference.observations import AnnotatedRule, MaskStack, Plane, find_planes
@@ -185,6 +186,20 @@ def label_map(model: ShapeModel, shape: SampledShape, spacing_mm: float, max_vox
     fit = Fit(shape.latent, Pose(), FitStatus.CONVERGED, "Drawn, not fitted.", 0, 0.0, np.zeros((size, size)))
     probability = occupancy(model, ShapeState((fit,), None), grid)
     return Volume((probability >= OCCUPIED).astype(np.uint8), grid)
+
+
+def shape_along_modes(
+    model: ShapeModel, modes: ShapeModes, coordinates: Mapping[int, float], spacing_mm: float | None, max_voxels: int
+) -> Mesh:
+    """Surface at coordinates (SD) along modes by rank.
+
+    Raises:
+        UnknownMode: no mode of a rank.
+        InvalidParameter: a coordinate out of its range, or so far out that there is no surface.
+        TooLarge: the evaluated grid would have more voxels than allowed.
+    """
+    require_step(model, spacing_mm, max_voxels)
+    return shape_along(model, modes, coordinates, spacing_mm)
 
 
 def describe(catalogue: Catalogue) -> Iterator[ShapeModel]:

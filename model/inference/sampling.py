@@ -9,12 +9,10 @@ from model.bundle import ShapeModel
 from model.errors import InvalidParameter
 from model.geometry import Pose
 from model.inference.mesh import Mesh
-from model.inference.surface import surface_of
+from model.inference.surface import require_spacing, surface_of
 
 #: Accepted temperatures: above 0, at most this.
 HIGHEST_TEMPERATURE = 2.0
-#: Accepted grid steps (mm).
-SPACING_RANGE_MM = (0.25, 10.0)
 
 
 @dataclass(frozen=True)
@@ -68,8 +66,4 @@ def _check(seed: int, temperature: float, spacing_mm: float | None) -> None:
             f"temperature is {temperature:g}; above 0 and at most {HIGHEST_TEMPERATURE:g} is accepted.",
             part="temperature",
         )
-    low, high = SPACING_RANGE_MM
-    if spacing_mm is not None and not low <= spacing_mm <= high:
-        raise InvalidParameter(
-            f"spacing_mm is {spacing_mm:g}; a grid step from {low:g} to {high:g} mm is accepted.", part="spacing_mm"
-        )
+    require_spacing(spacing_mm)

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from model.bundle import ShapeModel
+from model.errors import InvalidParameter
 from model.geometry import Grid, Pose
 from model.inference.discrepancy.process import Discrepancy
 from model.inference.isosurface import extract_surface
@@ -11,6 +12,8 @@ from model.inference.mesh import Mesh, extents, transformed
 
 #: Room around the box of all training shapes in which a surface is looked for.
 BOX_MARGIN_MM = 6.0
+#: Accepted grid steps (mm) of a surface that a caller chooses.
+SPACING_RANGE_MM = (0.25, 10.0)
 
 
 def surface_of(
@@ -52,6 +55,19 @@ def surface_of(
 def canonical_box(model: ShapeModel) -> Float[np.ndarray, "3"]:
     """Half size of the canonical box that is searched (mm)."""
     return np.asarray(model.manifest.half_extent_mm, float) + BOX_MARGIN_MM
+
+
+def require_spacing(spacing_mm: float | None) -> None:
+    """Refuse a grid step (mm) that a caller must not choose.
+
+    Raises:
+        InvalidParameter: outside 0.25 to 10.
+    """
+    low, high = SPACING_RANGE_MM
+    if spacing_mm is not None and not low <= spacing_mm <= high:
+        raise InvalidParameter(
+            f"spacing_mm is {spacing_mm:g}; a grid step from {low:g} to {high:g} mm is accepted.", part="spacing_mm"
+        )
 
 
 def covering_grid(mesh: Mesh, spacing_mm: float, margin_mm: float = 5.0) -> Grid:

@@ -33,6 +33,8 @@ MZ3_HAS_FACES, MZ3_HAS_VERTICES, MZ3_HAS_SCALARS = 1, 2, 8
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 #: From low to high (RGB): pale, orange, dark red; told apart in grey and by the colour-blind.
 RAMP = ((255, 245, 235), (241, 105, 19), (127, 39, 4))
+#: The same for scalars of both signs, from the most negative: blue, nearly white, dark orange.
+SIGNED_RAMP = ((5, 48, 97), (67, 147, 195), (247, 247, 247), (241, 105, 19), (127, 39, 4))
 
 
 def write_mesh(mesh: Mesh, format: str, *, space: str = "RAS", metadata: Mapping[str, object]) -> bytes:
@@ -64,11 +66,12 @@ def write_mesh(mesh: Mesh, format: str, *, space: str = "RAS", metadata: Mapping
 
 
 def colours(values: Float[np.ndarray, "v"]) -> UInt8[np.ndarray, "v 4"]:
-    """RGBA of scalars from zero to their maximum."""
-    top = float(values.max())
-    place = np.clip(values / top, 0.0, 1.0) if top > 0 else np.zeros(len(values))
-    stops = np.linspace(0.0, 1.0, len(RAMP))
-    channels = [np.interp(place, stops, [colour[channel] for colour in RAMP]) for channel in range(3)]
+    """RGBA of scalars from zero to their maximum, and alike to both sides of zero where there are negative ones."""
+    top, signed = float(np.abs(values).max()), bool((values < 0).any())
+    ramp = SIGNED_RAMP if signed else RAMP
+    stops = np.linspace(-1.0 if signed else 0.0, 1.0, len(ramp))
+    place = values / top if top > 0 else np.zeros(len(values))
+    channels = [np.interp(place, stops, [colour[channel] for colour in ramp]) for channel in range(3)]
     return np.asarray(np.rint(np.stack([*channels, np.full(len(values), 255.0)], axis=1)), np.uint8)
 
 

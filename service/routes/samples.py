@@ -1,6 +1,5 @@
 """``/v1/models/{model}/samples``: synthetic shapes, one or a ZIP that streams while it is made."""
 
-import hashlib
 from collections.abc import AsyncIterator
 from functools import partial
 from typing import Annotated
@@ -13,15 +12,12 @@ from model.bundle import ShapeModel
 from service import use_cases
 from service.adapters.sample_files import MANIFEST, Draw, SampleWriter, manifest_bytes
 from service.ports import SampleFormat, Ticket
+from service.routes.caching import cached, caching_headers, is_held, not_modified
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithModel, WithServices, WithTicket
 from service.routes.models import PATH
-from service.routes.negotiation import matches_etag
-from service.routes.responses import ZIP, Responses, attachment, files, problems, sample_media_type
+from service.routes.responses import ZIP, attachment, files, problems, sample_media_type
 from service.schemas import BatchQuery, SampleQuery, Seed
-
-#: A synthetic shape never changes: seed, query and the model's digest determine it.
-IMMUTABLE = "max-age=31536000, immutable"
 
 
 def samples_router() -> APIRouter:
@@ -41,7 +37,10 @@ def samples_router() -> APIRouter:
         methods=["GET"],
         response_class=Response,
         summary="One synthetic shape",
-        responses={**_cached_file(), **problems(404, 413, 422, 503)},
+        responses={
+            **cached(files(map(sample_media_type, SampleFormat), "the shape in the model's canonical frame, mm")),
+            **problems(404, 413, 422, 503),
+        },
     )
     return router
 
@@ -55,9 +54,9 @@ async def read_sample(
     ticket: WithTicket,
 ) -> Response:
     """A pure function of the model's digest, the seed and the query: cacheable for ever."""
-    headers = {"ETag": _etag(model, seed, query), "Cache-Control": _cache_control(services)}
-    if matches_etag(request.headers.get("if-none-match"), headers["ETag"]):
-        return Response(status_code=304, headers=headers)
+    headers = caching_headers(services, model, "sample", seed, query)
+    if is_held(request, headers):
+        return not_modified(headers)
     how, writer = _draw(services, query), SampleWriter(services.write_mesh, services.write_volume)
     file = await run_while_connected(request, ticket, lambda _: writer.make(model, seed, how))
     return Response(file.data, media_type=sample_media_type(query.format), headers=headers | attachment(file.name))
@@ -93,18 +92,3 @@ async def _zip_chunks(
 
 def _draw(services: Services, query: SampleQuery) -> Draw:
     return Draw(query.format, query.temperature, query.spacing_mm, services.settings.max_voxels)
-
-
-def _etag(model: ShapeModel, seed: int, query: SampleQuery) -> str:
-    parts = (model.digest, seed, query.format.value, query.temperature, query.spacing_mm)
-    return f'"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}"'
-
-
-def _cache_control(services: Services) -> str:
-    return f"{'private' if services.settings.keys else 'public'}, {IMMUTABLE}"
-
-
-def _cached_file() -> Responses:
-    answer = files(map(sample_media_type, SampleFormat), "the shape in the model's canonical frame, mm")
-    answer["headers"] = {"ETag": {"schema": {"type": "string"}, "description": "strong, of model, seed and query"}}
-    return {200: answer, 304: {"description": "the client holds it already"}}

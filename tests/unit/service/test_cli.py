@@ -154,6 +154,29 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["note.txt"]
 
 
+def test_modes_are_listed_by_rank(capsys):
+    assert run("modes", "--count", 2, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [mode["rank"] for mode in told["modes"]] == [1, 2]
+    assert run("modes", "--count", 50) == 0
+    assert "cumulative" in capsys.readouterr().out
+
+
+def test_modes_are_written_as_mean_and_both_ends(tmp_path):
+    folder = tmp_path / "modes"
+    assert run("modes", "--count", 1, "--format", "stl", "--spacing-mm", 2, "--output", folder) == 0
+    names = {f"{NAME}-{part}.stl" for part in ("mean", "mode1-minus", "mode1-plus")}
+    assert {file.name for file in folder.iterdir()} == names
+    assert run("modes", "--count", 1, "--format", "stl", "--spacing-mm", 2, "--output", folder) == BAD_INPUT
+    assert run("modes", "--count", 1, "--format", "stl", "--spacing-mm", 3, "--output", folder, "--force") == 0
+
+
+@pytest.mark.parametrize("words", [("--sd", 6), ("--count", 0), ("--spacing-mm", "nan"), ("--format", "nifti")])
+def test_bad_mode_options_end_with_status_2(tmp_path, words, capsys):
+    assert run("modes", "--output", tmp_path / "m", *words) == BAD_INPUT
+    assert "Traceback" not in capsys.readouterr().err
+
+
 def test_models_are_listed_and_broken_ones_named(capsys):
     assert run("models", "--json") == 0
     told = capsys.readouterr()

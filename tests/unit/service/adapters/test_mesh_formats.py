@@ -197,6 +197,15 @@ def test_larger_scalars_are_darker(values):
         np.testing.assert_array_equal(rgba[-1], [127, 39, 4, 255])
 
 
+@given(st.lists(st.floats(0.1, 10.0), min_size=1, max_size=10))
+def test_scalars_of_both_signs_are_coloured_alike_to_both_sides_of_zero(values):
+    sizes = np.array(values)
+    rgba = colours(np.concatenate([sizes, -sizes, [0.0]]))
+    np.testing.assert_array_equal(rgba[-1], [247, 247, 247, 255])
+    np.testing.assert_array_equal(rgba[np.argmax(sizes)], [127, 39, 4, 255])
+    np.testing.assert_array_equal(rgba[len(sizes) + np.argmax(sizes)], [5, 48, 97, 255])
+
+
 @given(st.text(max_size=40))
 def test_no_metadata_breaks_a_file(text):
     box = from_trimesh(trimesh.creation.box())

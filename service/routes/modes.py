@@ -1,0 +1,110 @@
+"""``/v1/models/{model}/modes`` and ``/shape``: what the dimensions of a model move."""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query, Request
+from starlette.responses import JSONResponse, Response
+
+from model.bundle import ShapeModel
+from service import use_cases
+from service.mode_presentation import mode_list
+from service.mode_schemas import ModeList, ModeMeshQuery, ModeQuery, ShapeQuery, parse_coordinates
+from service.ports import Ticket
+from service.routes.caching import cached, caching_headers, is_held, not_modified
+from service.routes.connection import run_while_connected
+from service.routes.dependencies import Services, WithModel, WithServices, WithTicket, address
+from service.routes.meshes import model_metadata
+from service.routes.models import PATH
+from service.routes.responses import MESH_MEDIA_TYPES, Responses, attachment, files, problems
+
+Rank = Annotated[int, Path(ge=1, description="of the mode, from 1")]
+
+
+def modes_router() -> APIRouter:
+    """The routes."""
+    router = APIRouter(prefix=f"{PATH}/{{model}}", tags=["modes"])
+    router.add_api_route(
+        "/modes",
+        list_modes,
+        methods=["GET"],
+        response_model=ModeList,
+        summary="Modes of shape, by what they move",
+        responses={**cached({"description": "the modes by rank"}), **problems(404, 503)},
+    )
+    for path, endpoint, summary in (
+        ("/modes/{rank}", read_mode, "The surface along one mode"),
+        ("/shape", read_shape, "The surface at coordinates along several modes"),
+    ):
+        router.add_api_route(
+            path,
+            endpoint,
+            methods=["GET"],
+            response_class=Response,
+            summary=summary,
+            responses={**_cached_mesh(), **problems(404, 413, 422, 503)},
+        )
+    return router
+
+
+async def list_modes(request: Request, model: WithModel, services: WithServices, ticket: WithTicket) -> Response:
+    """Dimensions of the flow's base, ranked by how far one standard deviation moves the mean surface."""
+    headers = caching_headers(services, model, "modes", address(request, ""))
+    if is_held(request, headers):
+        return not_modified(headers)
+    modes = await run_while_connected(request, ticket, lambda _: services.modes(model))
+    place = address(request, f"{PATH}/{model.manifest.name}/modes")
+    return JSONResponse(mode_list(model, modes, place).model_dump(mode="json"), headers=headers)
+
+
+async def read_mode(
+    rank: Rank,
+    query: Annotated[ModeQuery, Query()],
+    request: Request,
+    model: WithModel,
+    services: WithServices,
+    ticket: WithTicket,
+) -> Response:
+    """The mean shape moved `sd` standard deviations along the mode; vertices carry the displacement by one more."""
+    return await _mesh(request, services, ticket, model, {rank: query.sd}, query)
+
+
+async def read_shape(
+    query: Annotated[ShapeQuery, Query()],
+    request: Request,
+    model: WithModel,
+    services: WithServices,
+    ticket: WithTicket,
+) -> Response:
+    """The mean shape moved along several modes at once; vertices carry the distance to the mean."""
+    return await _mesh(request, services, ticket, model, parse_coordinates(query.mode), query)
+
+
+async def _mesh(
+    request: Request,
+    services: Services,
+    ticket: Ticket,
+    model: ShapeModel,
+    coordinates: Mapping[int, float],
+    query: ModeMeshQuery,
+) -> Response:
+    where = sorted(coordinates.items())
+    headers = caching_headers(services, model, "shape", where, query.format.value, query.spacing_mm)
+    if is_held(request, headers):
+        return not_modified(headers)
+    data = await run_while_connected(request, ticket, lambda _: _bytes(services, model, coordinates, query))
+    name = f"{model.manifest.name}-shape.{query.format.value}"
+    return Response(data, media_type=MESH_MEDIA_TYPES[query.format], headers=headers | attachment(name))
+
+
+def _bytes(services: Services, model: ShapeModel, coordinates: Mapping[int, float], query: ModeMeshQuery) -> bytes:
+    limit = services.settings.max_voxels
+    mesh = use_cases.shape_along_modes(model, services.modes(model), coordinates, query.spacing_mm, limit)
+    manifest = model.manifest
+    said = model_metadata(manifest.name, manifest.version, model.digest)
+    where = " ".join(f"{rank}:{sd:g}" for rank, sd in sorted(coordinates.items()))
+    return services.write_mesh(mesh, query.format.value, space=manifest.frame, metadata={**said, "modes": where})
+
+
+def _cached_mesh() -> Responses:
+    return cached(files(MESH_MEDIA_TYPES.values(), "the surface in the model's canonical frame, mm"))
