@@ -28,7 +28,7 @@ from model.inference.posterior import (
     mean_probability,
     open_variance,
 )
-from model.inference.reconstruction import OBSERVATION_BUDGET
+from model.inference.reconstruction import COVER_SHARE_OF_BAND, OBSERVATION_BUDGET
 from model.inference.thick_slices import through_thickness
 from training.cohorts.cohort import Case, Cohort
 from training.config import Regime
@@ -152,7 +152,9 @@ def with_precision(model: ShapeModel, precision: float) -> ShapeModel:
 def scores(model: ShapeModel, case: Case, regime: Regime) -> Iterator[tuple[Candidate, Score]]:
     """Score of each candidate on one drawing."""
     drawing = for_evaluation(case.mask, case.grid, regime)
-    observations = observe([drawing.stack], drawing.planes, budget=OBSERVATION_BUDGET, seed=0)
+    observations = observe(
+        [drawing.stack], drawing.planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=0
+    )
     options = FitOptions(robust=False)
     fitted = fit(model, observations, options)
     found, _ = through_thickness(model, fitted, [drawing.stack], observations, options)

@@ -17,7 +17,7 @@ from model.inference.discrepancy.conditioning import discrepancy_prior
 from model.inference.mesh import vertex_areas, volume_ml
 from model.inference.observations import observe
 from model.inference.posterior import fitted_logits
-from model.inference.reconstruction import OBSERVATION_BUDGET, Options, reconstruct
+from model.inference.reconstruction import COVER_SHARE_OF_BAND, OBSERVATION_BUDGET, Options, reconstruct
 from model.inference.reliability import USUAL_PLANES, Figures, figures_of
 from model.inference.uncertainty import surface_spread
 from training.cohorts.cohort import Case
@@ -105,7 +105,7 @@ def answered(model: ShapeModel, case: Case, drawing: Sections) -> Sound:
     """The answer to a drawing of a case, measured."""
     answer = reconstruct(model, drawing.stacks, Options(annotated=drawing.planes))
     found, mesh = answer.state.fits[0], answer.mesh
-    observations = observe(drawing.stacks, drawing.planes, budget=OBSERVATION_BUDGET, seed=0)
+    observations = observe(drawing.stacks, drawing.planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=0)
     figures = figures_of(model, found, drawing.stacks, observations, mesh, discrepancy_prior(model.manifest))
     sections = compared(observations, fitted_logits(model, found, observations.points), found.plane_weights)
     spread, sd = surface_spread(model, answer.state, mesh), mesh.scalars["surface_sd_mm"]

@@ -4,7 +4,7 @@ Each problem keeps its own damping and stops by itself; those that go on are eva
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -42,11 +42,16 @@ class Descent:
             return None
         step = damped_step(self.point, self.damping)
         self.expected = -float(step @ self.point.gradient + 0.5 * step @ self.point.curvature @ step)
-        if self.expected < options.tolerance:
-            # Behind rejected steps a step is short by its damping, not because the optimum is near.
-            self.status = FitStatus.CONVERGED if self.damping <= FREE_DAMPING else FitStatus.STALLED
-            return None
-        return Place(self.point.latent + step[:-POSE_SIZE], self.point.pose.moved(step[-POSE_SIZE:]))
+        place = Place(self.point.latent + step[:-POSE_SIZE], self.point.pose.moved(step[-POSE_SIZE:]))
+        if self.expected >= options.tolerance:
+            return place
+        # Behind rejected steps a step is short by its damping, not because the optimum is near.
+        self.status = FitStatus.CONVERGED if self.damping <= FREE_DAMPING else FitStatus.STALLED
+        if self.status is FitStatus.CONVERGED and self.expected > 0:
+            # The last step is so short that it needs no look at where it leads.
+            value = self.point.value - self.expected
+            self.point = replace(self.point, latent=place.latent, pose=place.pose, value=value)
+        return None
 
     def receive(self, trial: Point) -> None:
         """Take the trial point or raise the damping (Nielsen 1999)."""

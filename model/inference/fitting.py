@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from model.bundle import ShapeModel
@@ -38,7 +38,7 @@ __all__ = [
 #: Logits of the coarse stage are multiplied by this.
 COARSE_SHARPNESS = 0.3
 #: The coarse stage uses one observation of so many, but not fewer than these altogether.
-COARSE_EVERY, COARSE_FEWEST = 4, 500
+COARSE_EVERY, COARSE_FEWEST = 4, 300
 #: The coarse stage ends at this predicted decrease (nats) or after so many iterations.
 COARSE_TOLERANCE, COARSE_ITERATIONS = 1.0, 8
 #: A start is given up when after so many coarse iterations, or at their end, its objective exceeds the best one's by
@@ -46,6 +46,10 @@ COARSE_TOLERANCE, COARSE_ITERATIONS = 1.0, 8
 TRIAL_ITERATIONS, BEHIND_NATS, BEHIND_SHARE = 3, 10.0, (1.0, 0.25)
 #: Objects fill about this share of the model's box; a drawing shorter than the second share of that may be of one end.
 MEAN_SHARE, SHORT_SHARE = 0.8, 0.55
+#: A plane shows the object's extent along axes that it is inclined to by less than this (sine).
+IN_PLANE = 0.4
+#: A section of fewer observations tells no normal.
+FEWEST_IN_SECTION = 10
 
 
 def fit(model: ShapeModel, observations: Observations, options: FitOptions) -> Fit:
@@ -125,14 +129,27 @@ def _poses_beyond(model: ShapeModel, observations: Observations, poses: Sequence
 
     From the centroid of one drawn end the fit would turn and squeeze the object into that end.
     """
-    inside = observations.points[(observations.labels > 0) & (observations.weights > 0)]
+    drawn = (observations.labels > 0) & (observations.weights > 0)
+    inside, plane_of = observations.points[drawn], observations.plane_of[drawn]
     sizes = 2.0 * MEAN_SHARE * np.asarray(model.manifest.half_extent_mm)
-    extents = np.ptp(inside, axis=0)
-    axis = int(np.argmin(extents / sizes))
-    if extents[axis] > SHORT_SHARE * sizes[axis]:
+    # Between slices, half a gap to either side of the drawing may hold some of the object as well.
+    extents = np.ptp(inside, axis=0) * (1.0 + 1.0 / max(len(np.unique(plane_of)) - 1, 1))
+    shares = np.where(_shown(inside, plane_of), np.inf, extents / sizes)
+    axis = int(np.argmin(shares))
+    if shares[axis] > SHORT_SHARE:
         return []
     shift = 0.5 * (sizes[axis] - extents[axis]) * np.eye(3)[axis]
     return [replace(pose, position=pose.position + side * shift) for pose in poses for side in (-1.0, 1.0)]
+
+
+def _shown(points: Float[np.ndarray, "n 3"], plane_of: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "3"]:
+    """Along which axes some plane shows the whole extent, its section being closed."""
+    shown = np.zeros(3, bool)
+    for number in np.unique(plane_of):
+        section = points[plane_of == number]
+        if len(section) >= FEWEST_IN_SECTION:
+            shown |= np.abs(np.linalg.svd(section - section.mean(axis=0), full_matrices=False)[2][2]) < IN_PLANE
+    return shown
 
 
 def fit_from(

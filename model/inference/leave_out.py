@@ -44,7 +44,7 @@ CURVATURE_FLOOR = 1e-4
 
 
 #: Trials see one observation of so many, but not fewer than these altogether.
-TRIAL_EVERY, TRIAL_FEWEST = 4, 500
+TRIAL_EVERY, TRIAL_FEWEST = 4, 300
 #: They start from the optimum of all and end at this predicted decrease (nats) or, the first time, after so many
 #: iterations.
 TRIAL_TOLERANCE, TRIAL_ITERATIONS = 0.5, 8
@@ -145,7 +145,7 @@ def verdicts(
     terms = whole.by_plane(place)
     seen = np.flatnonzero([term.expected > 0 for term in terms])
     if tried is None:
-        gains = leave_out_gains(terms, whole.at(place.latent, place.pose).curvature, seen)
+        gains = leave_out_gains(terms, whole.gathered(place, terms).curvature, seen)
         tried = suspects(gains, typical_gains(terms, gains), seen)
     if not tried.size:
         return []
@@ -158,8 +158,10 @@ def verdicts(
 
 
 def _verdict(whole: Objective, value: float, point: Point, number: int, seen: Int[np.ndarray, "j"]) -> Verdict:
-    after = whole.by_plane(Place(point.latent, point.pose))
-    typical = typical_gains(after, leave_out_gains(after, point.curvature, seen[seen != number]))
+    place = Place(point.latent, point.pose)
+    after = whole.by_plane(place)
+    rest = whole.gathered(place, [term for plane, term in enumerate(after) if plane != number])
+    typical = typical_gains(after, leave_out_gains(after, rest.curvature, seen[seen != number]))
     return Verdict(number, value - point.value, float(typical[number]))
 
 

@@ -125,6 +125,17 @@ class Objective:
             terms.append(_data_term(logits[rows], jacobian[rows], self.labels[rows], self.weights[rows]))
         return terms
 
+    def gathered(self, place: Place, terms: Sequence[DataTerm]) -> Point:
+        """What the terms of some planes make together with the priors."""
+        data = DataTerm(
+            sum(term.value for term in terms),
+            sum(term.expected for term in terms),
+            np.sum([term.gradient for term in terms], axis=0),
+            np.sum([term.curvature for term in terms], axis=0),
+        )
+        base, by_latent = self.base_jacobian(place.latent[None])
+        return self.point(place, data, base[0], by_latent[0])
+
     def point(
         self, place: Place, data: DataTerm, base: Float[np.ndarray, "d"], by_latent: Float[np.ndarray, "d d"]
     ) -> Point:

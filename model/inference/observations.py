@@ -32,6 +32,8 @@ COVER_MARGIN_MM = 30.0
 COVER_DECAY_MM = 5.0
 #: Share of the budget that is kept for the cover when the band alone would use it up.
 COVER_SHARE = 0.2
+#: With a limited cover at least this many observations of it are used.
+COVER_LEAST = 300
 #: Smallest number of observations that can be asked for.
 SMALLEST_BUDGET = 16
 #: Planes are thinned out evenly when their sections have more voxels than this together.
@@ -82,7 +84,9 @@ class _Candidates:
         return _Candidates(self.voxel[rows], self.plane_of[rows], self.label[rows], self.distance[rows])
 
 
-def observe(stacks: Sequence[MaskStack], planes: Sequence[Plane], *, budget: int, seed: int) -> Observations:
+def observe(
+    stacks: Sequence[MaskStack], planes: Sequence[Plane], *, budget: int, seed: int, cover: float = np.inf
+) -> Observations:
     """Observations on the planes: all voxels near contours, a thin re-weighted cover of the rest.
 
     Voxels in a narrow band around the in-plane contour (`model.inference.plane_sampling.band_width`) are all
@@ -99,6 +103,8 @@ def observe(stacks: Sequence[MaskStack], planes: Sequence[Plane], *, budget: int
         planes: as `find_planes` returns them.
         budget: number of observations, at most.
         seed: decides which voxels the samples hold; the same seed gives the same observations.
+        cover: observations of the cover for each one of the band, at most; no fewer than `COVER_LEAST` altogether. A
+            small object has few voxels in the band, and the rest of the budget would tell nothing more of it.
 
     Raises:
         InvalidParameter: budget below `SMALLEST_BUDGET`.
@@ -115,7 +121,7 @@ def observe(stacks: Sequence[MaskStack], planes: Sequence[Plane], *, budget: int
     spacings = [_in_plane_spacing(stacks[plane.stack].grid, plane) for plane in planes]
     area = np.array([float(spacing.prod()) for spacing in spacings])[candidates.plane_of]
     band = np.array([band_width(spacing) for spacing in spacings])[candidates.plane_of]
-    rows, weights = _draw(candidates.distance, band, area, budget, rng)
+    rows, weights = _draw(candidates.distance, band, area, budget, cover, rng)
     drawn = candidates.at(rows)
     points = _world_points(stacks, planes, drawn)
     return Observations(points, drawn.label.astype(float), weights * step, tuple(planes), drawn.plane_of)
@@ -212,6 +218,7 @@ def _draw(
     band: Float[np.ndarray, "m"],
     area: Float[np.ndarray, "m"],
     budget: int,
+    cover: float,
     rng: np.random.Generator,
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Rows that are used and the area (mm^2) that each stands for."""
@@ -219,9 +226,10 @@ def _draw(
     near_rows, far_rows = np.flatnonzero(near), np.flatnonzero(~near)
     reserved = min(far_rows.size, int(COVER_SHARE * budget))
     near_count = min(near_rows.size, budget - reserved)
+    far_count = int(min(budget - near_count, max(COVER_LEAST, cover * near_count)))
     far_size = area[far_rows] / (1.0 + np.minimum(distance[far_rows], COVER_MARGIN_MM) / COVER_DECAY_MM)
     rows, weights = [], []
-    for group, size, count in ((near_rows, area[near_rows], near_count), (far_rows, far_size, budget - near_count)):
+    for group, size, count in ((near_rows, area[near_rows], near_count), (far_rows, far_size, far_count)):
         probability = inclusion_probabilities(size, count)
         chosen = systematic_sample(probability, rng)
         rows.append(group[chosen])

@@ -12,7 +12,7 @@ from model.errors import InvalidMask, InvalidParameter
 from model.inference.agreement import disagreeing_planes, plane_warnings, sections_of
 from model.inference.calipers import USUAL_EXTENTS, Extent, direction_of, measure_extents
 from model.inference.coverage import coverage_warnings
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_prior, with_discrepancy
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, corrected, discrepancy_prior
 from model.inference.ensemble import fit_ensemble
 from model.inference.estimates import Estimate
 from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
@@ -29,7 +29,7 @@ from model.inference.typicality import (
     typicality,
     typicality_warnings,
 )
-from model.inference.uncertainty import ShapeState, area_estimate, surface_spread, volume_estimate
+from model.inference.uncertainty import ShapeState, area_estimate, surface_spread, uncalibrated, volume_estimate
 
 UncertaintyRule = Literal["laplace", "ensemble", "none"]
 #: Called with the name of each stage as it begins: observations, fit, surface, uncertainty.
@@ -37,6 +37,8 @@ Watch = Callable[[str], None]
 
 #: Point observations used of all voxels on the annotated planes.
 OBSERVATION_BUDGET = 2500
+#: Of them at most so many off the contours for each one near them.
+COVER_SHARE_OF_BAND = 0.6
 #: Range of `Options.resolution_mm`.
 RESOLUTION_RANGE_MM = (0.25, 10.0)
 
@@ -125,13 +127,13 @@ def reconstruct(
     _check(options)
     watch("observations")
     planes = find_planes(stacks, options.annotated)
-    drawing = observe(stacks, planes, budget=OBSERVATION_BUDGET, seed=options.seed)
+    drawing = observe(stacks, planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=options.seed)
     watch("fit")
     usual = discrepancy_prior(model.manifest)
     model, settled, observations = _settled(model, stacks, drawing, FitOptions(mirror=options.mirror), usual)
 
     def correct(fit: Fit) -> Fit:
-        return with_discrepancy(model, fit, stacks, drawing, discrepancy_prior(model.manifest, options.fidelity))
+        return corrected(model, fit, stacks, drawing, discrepancy_prior(model.manifest, options.fidelity))
 
     found = correct(settled)
     watch("surface")
@@ -145,11 +147,13 @@ def reconstruct(
     watch("uncertainty")
     state = _state(model, observations, found, options, correct)
     spread = surface_spread(model, state, mesh)
-    if spread is not None:
-        mesh = replace(mesh, scalars={"surface_sd_mm": spread.sd()})
+    sd_mm = None if spread is None else spread.sd()
+    if sd_mm is not None:
+        mesh = replace(mesh, scalars={"surface_sd_mm": sd_mm})
+    plain_sd = None if sd_mm is None or state.covariance is None else uncalibrated(model, sd_mm)
     trusted = observations if found.plane_weights is None else reweighted(observations, found.plane_weights)
     sections = sections_of(observations, fitted_logits(model, found, observations.points), found.plane_weights)
-    figures = figures_of(model, found, stacks, drawing, mesh, usual)
+    figures = figures_of(model, found, stacks, drawing, mesh, usual, plain_sd)
     thick = thickness_warnings(stacks, observations.planes, mesh)
     density, percentile = typicality(model, found, replace(figures, misfit_mm=0.0) if thick else figures)
     probabilities = predictive_probabilities(model, sections)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from model.bundle import ShapeModel
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, corrected
 from model.inference.fitting import Fit, FitOptions, refit, searched
 from model.inference.mask_stack import MaskStack, Plane, section_of
 from model.inference.mesh import Mesh, volume_ml
@@ -73,13 +73,17 @@ def figures_of(
     observations: Observations,
     mesh: Mesh,
     prior: DiscrepancyPrior,
+    sd_mm: Float[np.ndarray, "v"] | None = None,
 ) -> Figures:
-    """Figures of a fit under the model's own discrepancy, whatever fidelity the caller asked for."""
-    made = found.discrepancy
-    same = made is not None and (made.covariance, made.noise_mm) == (prior.covariance, prior.noise_mm)
-    judged = found if same else with_discrepancy(model, found, stacks, observations, prior)
+    """Figures of a fit under the model's own discrepancy, whatever fidelity the caller asked for.
+
+    Args:
+        sd_mm: posterior SD of each vertex by the fit itself, where it is known.
+    """
     step = max(1, len(mesh.vertices) // JUDGED_VERTICES)
-    spread = _mean_sd(model, judged, mesh.vertices[::step])
+    judged = corrected(model, found, stacks, observations, prior)
+    known = sd_mm is not None and judged is found
+    spread = float(sd_mm[::step].mean()) if known else _mean_sd(model, judged, mesh.vertices[::step])
     return Figures(_planes_used(found, observations), _misfit(judged), spread)
 
 
@@ -94,27 +98,24 @@ def less_trusting(
     """Model and fit with less trust in the drawing when that is rough, otherwise as they are.
 
     First a single plane that is to blame is looked for, more thoroughly than in any fit. Drawings on thick slices are
-    not judged.
+    not judged. A fit that is found good comes back with its discrepancy.
     """
     if any(thickness_mm(stacks[plane.stack], plane) for plane in observations.planes):
         return model, found
-    if not _is_rough(model, found, stacks, observations, prior):
-        return model, found
+    judged = corrected(model, found, stacks, observations, prior)
+    if not _is_rough(model, judged, observations):
+        return model, judged
     found = searched(model, observations, found, options)
-    if not _is_rough(model, found, stacks, observations, prior):
-        return model, found
+    judged = corrected(model, found, stacks, observations, prior)
+    if not _is_rough(model, judged, observations):
+        return model, judged
     lower = ROUGH_SHARE * model.manifest.likelihood_precision
     doubting = replace(model, manifest=replace(model.manifest, likelihood_precision=lower))
     return doubting, refit(doubting, observations, found, options)
 
 
-def _is_rough(
-    model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations, prior: DiscrepancyPrior
-) -> bool:
-    usual = highest_usual(model.manifest.usual, "misfit", _planes_used(found, observations))
-    if not np.isfinite(usual):
-        return False
-    return _misfit(with_discrepancy(model, found, stacks, observations, prior)) > usual
+def _is_rough(model: ShapeModel, judged: Fit, observations: Observations) -> bool:
+    return _misfit(judged) > highest_usual(model.manifest.usual, "misfit", _planes_used(judged, observations))
 
 
 def _planes_used(found: Fit, observations: Observations) -> int:

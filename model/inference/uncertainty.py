@@ -76,6 +76,12 @@ def calibrated_scale(model: ShapeModel) -> tuple[float, float]:
     return known.get("sd_scale", 1.0), known.get("offset_mm", 0.0)
 
 
+def uncalibrated(model: ShapeModel, sd_mm: Float[np.ndarray, "v"]) -> Float[np.ndarray, "v"]:
+    """Posterior SD of vertices (mm) before `calibrated_scale` widened or narrowed it."""
+    scale, offset = calibrated_scale(model)
+    return np.asarray(np.sqrt(np.maximum(np.square(sd_mm) - offset**2, 0.0)) / scale)
+
+
 def _local_spread(found: Fit, mesh: Mesh, by_point: Float[np.ndarray, "v 3"], scale: float) -> LocalSpread | None:
     if found.discrepancy is None:
         return None

@@ -71,6 +71,16 @@ def with_discrepancy(
     return replace(found, discrepancy=discrepancy_of(model, found, stacks, observations, prior))
 
 
+def corrected(
+    model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations, prior: DiscrepancyPrior
+) -> Fit:
+    """The fit with its discrepancy under a prior; itself when it has that already."""
+    made = found.discrepancy
+    if made is not None and (made.covariance, made.noise_mm) == (prior.covariance, prior.noise_mm):
+        return found
+    return with_discrepancy(model, found, stacks, observations, prior)
+
+
 def discrepancy_of(
     model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations, prior: DiscrepancyPrior
 ) -> Discrepancy | None:

@@ -47,8 +47,12 @@ def test_gain_is_that_of_a_refit_to_second_order():
 def test_planes_add_up_to_the_data_term():
     observations = observed(stack_with(None), PARALLEL)
     start = starting_poses(observations, PLAIN)[0]
-    found = fit(MODEL, observations, PLAIN)
-    terms = Objective(MODEL, observations, start, PLAIN).by_plane(Place(found.latent, found.pose))
+    found = fit(MODEL, observations, replace(PLAIN, tolerance=1e-8))
+    objective, place = Objective(MODEL, observations, start, PLAIN), Place(found.latent, found.pose)
+    terms = objective.by_plane(place)
+    whole, gathered = objective.at(place.latent, place.pose), objective.gathered(place, terms)
+    np.testing.assert_allclose(gathered.value, whole.value, rtol=1e-9)
+    np.testing.assert_allclose(gathered.curvature, whole.curvature, atol=1e-5 * np.abs(whole.curvature).max())
     prior = found.objective - sum(term.value for term in terms)
     assert 0.0 <= prior < 0.5 * found.objective
     rest = found.precision - sum(term.curvature for term in terms)

@@ -284,6 +284,15 @@ def test_all_voxels_of_the_band_are_used_when_they_fit():
     assert not used[14].all()
 
 
+def test_a_limited_cover_keeps_the_band_and_the_sums():
+    stack, planes = example((1.0, 1.0, 1.0))
+    whole, limited = (observe([stack], planes, budget=10**6, seed=1, cover=cover) for cover in (np.inf, 0.5))
+    certain = np.isclose(limited.weights, limited.weights.min())
+    assert len(limited.points) < 0.7 * len(whole.points)
+    assert max(300, round(0.5 * certain.sum())) >= (~certain).sum()
+    np.testing.assert_allclose(limited.weights.sum(), whole.weights.sum(), rtol=0.15)
+
+
 def test_the_same_seed_gives_the_same_observations():
     stack, planes = example()
     one, two, other = (observe([stack], planes, budget=700, seed=seed) for seed in (5, 5, 6))

@@ -54,8 +54,9 @@ def ball(radius):
 
 
 def test_sound_drawings_are_seldom_warned_of():
-    warned = [bool(answered(drawing).warnings) for case in CASES for drawing in sound_drawings(case)]
-    assert np.mean(warned) <= 0.2  # one of ten drawings lies above each quantile
+    told = [answered(drawing).warnings for case in CASES for drawing in sound_drawings(case)]
+    above = [any("is usual" in sentence for sentence in sentences) for sentences in told]
+    assert np.mean(above) <= 0.2  # one of ten drawings lies above each quantile
 
 
 def test_noise_of_the_annotator_is_told():
