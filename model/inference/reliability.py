@@ -82,8 +82,10 @@ def figures_of(
     """
     step = max(1, len(mesh.vertices) // JUDGED_VERTICES)
     judged = corrected(model, found, stacks, observations, prior)
-    known = sd_mm is not None and judged is found
-    spread = float(sd_mm[::step].mean()) if known else _mean_sd(model, judged, mesh.vertices[::step])
+    if sd_mm is None or judged is not found:
+        spread = _mean_sd(model, judged, mesh.vertices[::step])
+    else:
+        spread = float(sd_mm[::step].mean())
     return Figures(_planes_used(found, observations), _misfit(judged), spread)
 
 
