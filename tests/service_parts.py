@@ -14,6 +14,7 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI
 from jaxtyping import Float
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from model.bundle import ShapeModel
 from model.geometry import Grid, Pose
@@ -49,7 +50,7 @@ def app_for(folder: Path, *models: ShapeModel, log: StringIO | None = None, **ch
 
 
 @contextmanager
-def running(app: FastAPI, *, headers: Mapping[str, str] | None = None, root_path: str = "") -> Iterator[httpx.Client]:
+def running(app: ASGIApp, *, headers: Mapping[str, str] | None = None, root_path: str = "") -> Iterator[httpx.Client]:
     """A client of a real server on a free port of this machine."""
     config = uvicorn.Config(app, host="127.0.0.1", port=0, root_path=root_path, log_config=None, access_log=False)
     server = uvicorn.Server(config)
@@ -64,6 +65,15 @@ def running(app: FastAPI, *, headers: Mapping[str, str] | None = None, root_path
     finally:
         server.should_exit = True
         thread.join(30.0)
+
+
+def behind_prefix(app: ASGIApp, prefix: str) -> ASGIApp:
+    """The application as a server gives it requests below a prefix that a proxy strips."""
+
+    async def proxied(scope: Scope, receive: Receive, send: Send) -> None:
+        await app({**scope, "root_path": prefix} if scope["type"] == "http" else scope, receive, send)
+
+    return proxied
 
 
 def sparse_ellipsoid(

@@ -48,23 +48,25 @@ def page_router() -> APIRouter:
 
 def read_page(request: Request) -> Response:
     """The page itself; all its addresses are relative, so that it works behind a prefix."""
-    return _file(request, "index.html", _ASK_AGAIN)
+    return _file(request, "index.html")
 
 
 def read_asset(name: Annotated[str, Path(pattern=r"^[A-Za-z0-9_.-]+$")], request: Request) -> Response:
     """A script, a style or the example."""
-    return _file(request, f"page/{name}", _IMMUTABLE if _DIGEST.search(name) else _ASK_AGAIN)
+    return _file(request, f"page/{name}")
 
 
-def _file(request: Request, name: str, caching: str) -> Response:
+def _file(request: Request, name: str) -> Response:
     found = _built() / name
     if not found.is_file():
         raise HTTPException(404)
-    headers = {**_SECURITY, "Cache-Control": caching, "Vary": "Accept-Encoding"}
-    media_type = _media_type(found.name)
-    if media_type.startswith("text/") and "gzip" in request.headers.get("accept-encoding", ""):
-        return Response(_compressed(name), media_type=media_type, headers={**headers, "Content-Encoding": "gzip"})
-    return Response(found.read_bytes(), media_type=media_type, headers=headers)
+    headers, media_type = {**_SECURITY, "Cache-Control": _ASK_AGAIN}, _media_type(found.name)
+    if not _DIGEST.search(name):
+        return Response(found.read_bytes(), media_type=media_type, headers=headers)
+    headers |= {"Cache-Control": _IMMUTABLE, "Vary": "Accept-Encoding"}
+    if "gzip" not in request.headers.get("accept-encoding", ""):
+        return Response(found.read_bytes(), media_type=media_type, headers=headers)
+    return Response(_compressed(name), media_type=media_type, headers={**headers, "Content-Encoding": "gzip"})
 
 
 def _built() -> Traversable:

@@ -5,11 +5,19 @@ import re
 import httpx
 import numpy as np
 import pytest
-from starlette.types import Receive, Scope, Send
 
 from model.geometry import Grid
 from service.routes.page import POLICY
-from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, nifti_of, running, sparse_ellipsoid
+from tests.service_parts import (
+    NAME,
+    app_for,
+    behind_prefix,
+    mask_bytes,
+    mask_parts,
+    nifti_of,
+    running,
+    sparse_ellipsoid,
+)
 
 
 @pytest.fixture(scope="module")
@@ -72,12 +80,7 @@ def test_the_page_is_open_where_everything_else_asks_for_a_key(tmp_path):
 
 
 def test_the_page_stands_behind_a_prefix(tmp_path):
-    app = app_for(tmp_path, api_keys=("k",))
-
-    async def proxied(scope: Scope, receive: Receive, send: Send) -> None:
-        await app({**scope, "root_path": "/shape"} if scope["type"] == "http" else scope, receive, send)
-
-    with running(proxied) as client:
+    with running(behind_prefix(app_for(tmp_path, api_keys=("k",)), "/shape")) as client:
         page = client.get("/shape/")
         assert page.status_code == 200
         assert all(client.get(httpx.URL("/shape/").join(name)).status_code == 200 for name in assets(page.text))

@@ -51,7 +51,7 @@ export class LookControls {
   }
 
   private colourField(colouring: Colouring): HTMLElement {
-    const choice = h('select', {}, option('scalar', colouring.label), option('plain', T.look.plain))
+    const choice = h('select', {}, option('scalar', colouring.name), option('plain', T.look.plain))
     choice.addEventListener('change', () => {
       const chosen = choice.value === 'scalar' ? colouring : null
       this.change({ scale: chosen?.scale ?? null })

@@ -116,6 +116,7 @@ export const T = {
     volume: 'Volume',
     area: 'Surface area',
     sd: 'Surface uncertainty',
+    sdShort: 'Surface SD',
     sdLegend: 'Standard deviation of the surface',
     sdMax: (max: string) => `mean SD; largest ${max} mm`,
     none: 'not known',
@@ -148,7 +149,7 @@ export const T = {
     segmentation: 'Segmentation',
     entropy: 'Entropy',
     entropyLegend: 'Voxel entropy',
-    hint: 'White line: edge of the dense segmentation. Blue line: the drawing, on slices that hold one. Scroll with the wheel or the slider.',
+    hint: 'Light blue line: edge of the dense segmentation. Green line: the drawing, on slices that hold one. Scroll with the wheel or the slider.',
   },
 
   files: {
@@ -195,8 +196,7 @@ export const T = {
       `, typicality ${summary.typicality_percentile.toFixed(0)} / 100.`,
     open: 'All figures, sections and files of this result',
     label: (model: string, at: Date) => `${model}, drawn ${time(at)}`,
-    suggested: (gain: number | null) =>
-      gain === null ? 'The next plane that would tell most:' : `The next plane that would tell most takes away ${(100 * gain).toFixed(0)} % of the uncertainty:`,
+    suggested: (gain: number) => `Draw this plane next: it is expected to take away ${(100 * gain).toFixed(0)} % of the uncertainty.`,
     goTo: (plane: string, slice: number) => `Go to ${plane.toLowerCase()} slice ${slice}`,
   },
 

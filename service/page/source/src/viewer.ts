@@ -44,8 +44,9 @@ export class SurfaceView {
   private frame: Surface | null = null
   private look = PLAIN_LOOK
   private shader = 0
+  private readonly size: number
 
-  constructor(label: string) {
+  constructor(label: string, options: { cube?: boolean; size?: number } = {}) {
     this.canvas = h('canvas', { tabindex: 0, role: 'img', 'aria-label': `${label} ${T.turnByKeys}` })
     this.element = h('div', { class: 'surface-view' }, this.canvas)
     this.niivue = new Niivue({
@@ -53,7 +54,7 @@ export class SurfaceView {
       dragAndDropEnabled: false,
       isColorbar: false,
       isOrientationTextVisible: false,
-      isOrientCube: true,
+      isOrientCube: options.cube ?? true,
       loadingText: '',
       logLevel: 'error',
       multiplanarShowRender: SHOW_RENDER.ALWAYS,
@@ -62,6 +63,7 @@ export class SurfaceView {
       clipPlaneHotKey: '',
       cycleClipPlaneHotKey: '',
     })
+    this.size = options.size ?? 1
     this.canvas.addEventListener('keydown', (event) => this.turnByKey(event))
   }
 
@@ -77,8 +79,19 @@ export class SurfaceView {
     if (this.ready) this.draw()
   }
 
+  /** Make everything ready to draw; the first time it takes longer than any drawing. */
+  start(): Promise<unknown> {
+    this.ready ??= this.niivue.attachToCanvas(this.canvas, true).then(() => {
+      this.niivue.setSliceType(SLICE_TYPE.RENDER)
+      this.reset()
+      this.shader = this.niivue.setCustomMeshShader(SHADER, 'Even')
+      onTheme(() => this.paintBack())
+    })
+    return this.ready
+  }
+
   reset(): void {
-    this.niivue.setScale(1)
+    this.niivue.setScale(this.size)
     this.niivue.setRenderAzimuthElevation(...START)
   }
 
@@ -92,16 +105,6 @@ export class SurfaceView {
   copyTo(target: HTMLCanvasElement): void {
     this.niivue.drawScene()
     target.getContext('2d')!.drawImage(this.canvas, 0, 0, target.width, target.height)
-  }
-
-  private start(): Promise<unknown> {
-    this.ready ??= this.niivue.attachToCanvas(this.canvas, true).then(() => {
-      this.niivue.setSliceType(SLICE_TYPE.RENDER)
-      this.niivue.setRenderAzimuthElevation(...START)
-      this.shader = this.niivue.setCustomMeshShader(SHADER, 'Even')
-      onTheme(() => this.paintBack())
-    })
-    return this.ready
   }
 
   private paintBack(): void {

@@ -2,7 +2,7 @@
 
 import { type Api, formOf, isAbort, resultPath, sentence } from '../api'
 import { scaleFromZero } from '../colour'
-import { button, field, h, option, replace } from '../dom'
+import { button, field, h, mark, option, replace } from '../dom'
 import { PLANES, planeName } from '../grid'
 import { LookControls, slider } from '../look'
 import { readMz3 } from '../mesh'
@@ -131,7 +131,7 @@ export class DrawView {
       const form = formOf([mask], { model: this.model.value }, planes)
       const summary = await this.api.reconstruct(form, signal)
       await this.showSurface(summary, signal)
-      this.element.dataset['latency'] = String(Math.round(performance.now() - began))
+      mark(this.element, performance.now() - began)
       this.status.say(T.draw.done(planes.length, (performance.now() - began) / 1000))
       this.keepOnly(summary)
       this.suggest(await nextPlane(this.api, summary.id, signal))
@@ -143,7 +143,7 @@ export class DrawView {
   private async showSurface(summary: Summary, signal: AbortSignal): Promise<void> {
     const surface = readMz3(await this.api.bytes(resultPath(summary.id, '/mesh?format=mz3'), signal))
     const scale = surface.scalars && scaleFromZero(surface.scalars)
-    const look = this.look.begin(scale && { name: 'sd', label: T.figures.sdLegend, unit: 'mm', scale }, false)
+    const look = this.look.begin(scale && { name: T.figures.sdShort, label: T.figures.sdLegend, unit: 'mm', scale }, false)
     await this.surface.show(surface, look)
     this.look.element.hidden = false
     replace(this.told, ...this.findings(summary))

@@ -18,7 +18,7 @@ export class Gallery {
   private readonly seed = h('input', { type: 'number', min: 0, max: LARGEST_SEED, step: 1 })
   private readonly temperature: HTMLInputElement
   private readonly grid = h('ul', { class: 'shapes' })
-  private readonly painter = new SurfaceView(T.gallery.painter)
+  private readonly painter = new SurfaceView(T.gallery.painter, { cube: false, size: 1.6 })
   private readonly told = h('p', { class: 'hint', role: 'status' })
   private model: ModelDescription | null = null
   private working = new AbortController()

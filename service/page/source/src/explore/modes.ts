@@ -2,7 +2,7 @@
 
 import { type Api, isAbort } from '../api'
 import { type Scale, legend, scaleAroundZero } from '../colour'
-import { button, h, replace } from '../dom'
+import { button, h, mark, replace } from '../dom'
 import { slider } from '../look'
 import { frame, readMz3 } from '../mesh'
 import { T } from '../text'
@@ -17,7 +17,7 @@ const REST_MS = 250
 
 export class Modes {
   readonly element = h('section', { class: 'card modes' })
-  private readonly view = new SurfaceView(T.modes.surface)
+  private readonly view = new SurfaceView(T.modes.surface, { size: 1.4 })
   private readonly sliders = h('div', { class: 'sliders' })
   private readonly legendPlace = h('div', { class: 'legend-place' })
   private readonly told = h('p', { class: 'hint', role: 'status' })
@@ -84,7 +84,7 @@ export class Modes {
       const moved = this.wanted
       this.wanted = null
       await this.fetch(COARSER)
-      this.element.dataset['latency'] = String(Math.round(performance.now() - moved))
+      mark(this.element, performance.now() - moved)
     }
     this.busy = false
     this.rest = window.setTimeout(() => void this.fetch(1), REST_MS)

@@ -32,7 +32,7 @@ export class ResultPanel {
   async show(summary: Summary, drawn: DrawnPlanes | null, signal: AbortSignal): Promise<void> {
     const surface = readMz3(await this.api.bytes(resultPath(summary.id, '/mesh?format=mz3'), signal))
     const colouring: Colouring | null = surface.scalars && {
-      name: 'sd',
+      name: T.figures.sdShort,
       label: T.figures.sdLegend,
       unit: 'mm',
       scale: scaleFromZero(surface.scalars),

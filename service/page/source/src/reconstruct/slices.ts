@@ -16,7 +16,8 @@ const OWN_SPACING_MM = 1
 const ENTROPY: Scale = { ramp: GLOWING, low: 0, high: Math.LN2 }
 const LEAST_ENTROPY = 0.02
 const OBJECT: Rgb = [92, 108, 116]
-const SEEN: Rgb = [77, 208, 245]
+const EDGE = '#8fe8ff'
+const SEEN = '#7dff8a'
 
 type Layer = 'both' | 'segmentation' | 'entropy'
 
@@ -63,11 +64,11 @@ function painter(labels: Volume, entropy: Volume | null, layer: Layer): Paint {
 /** The object's edge, and on annotated slices that of the drawing. */
 function edges(labels: Volume, drawn: DrawnPlanes | null): Over {
   return (context, pane) => {
-    outline(context, pane, (voxel) => labels.values[voxel]! > 0, 'white')
+    outline(context, pane, (voxel) => labels.values[voxel]! > 0, EDGE)
     const plane = drawn?.planes.find((p) => p.stack === 0 && p.axis === pane.layout.axis && p.index === pane.slice)
     if (!plane) return
     const voxels = new Set(voxelsOf(labels, plane).map((index) => voxelNumber(labels, index)))
-    outline(context, pane, (voxel) => voxels.has(voxel), `rgb(${SEEN.join(' ')})`)
+    outline(context, pane, (voxel) => voxels.has(voxel), SEEN)
   }
 }
 

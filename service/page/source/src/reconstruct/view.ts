@@ -21,7 +21,7 @@ export class ReconstructView {
   private readonly preview = new Preview()
   private readonly result: ResultPanel
   private readonly send: HTMLButtonElement
-  private readonly stage = h('div', { class: 'stage', hidden: true })
+  private readonly stage = h('div', { class: 'stage offscreen' })
   private readonly below = h('div', { class: 'below' })
   private readonly welcome: HTMLElement
   private drawn: DrawnPlanes | null = null
@@ -46,6 +46,7 @@ export class ReconstructView {
 
   async start(): Promise<void> {
     await this.guarded(() => this.form.loadModels())
+    await this.surface.start()
   }
 
   /** A result that was made before, by its link. */
@@ -129,7 +130,7 @@ export class ReconstructView {
 
   private openStage(): void {
     this.welcome.hidden = true
-    this.stage.hidden = false
+    this.stage.classList.remove('offscreen')
   }
 
   private async guarded(work: () => Promise<void>): Promise<void> {
