@@ -1,7 +1,7 @@
 """How fast the page is: from a click, a lifted pen and a moved slider to the surface, and how large it is.
 
 Starts the service with its shipped models in a process of its own and plays the page in Debian's Chromium, which draws
-by software. The page measures from the event to the surface drawn; a click is measured from outside, so that it includes
+by software. The page measures from the event to the surface drawn; a click is measured from outside and so includes
 the browser's own way.
 
     python -m benchmarks.page

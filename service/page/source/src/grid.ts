@@ -62,6 +62,25 @@ export function toWorld(grid: Grid, index: Vec3): Vec3 {
   }) as Vec3
 }
 
+/** World (mm) to voxel coordinates, by Cramer's rule. */
+export function voxelOfWorld(grid: Grid): (world: Vec3) => Vec3 {
+  const columns = [0, 1, 2].map((axis) => [0, 1, 2].map((row) => grid.affine[row]![axis]!) as Vec3) as [Vec3, Vec3, Vec3]
+  const size = dot(columns[0], cross(columns[1], columns[2]))
+  const rows = [0, 1, 2].map((n) => cross(columns[(n + 1) % 3]!, columns[(n + 2) % 3]!))
+  return (world) => {
+    const away = world.map((value, row) => value - grid.affine[row]![3]!) as Vec3
+    return rows.map((row) => dot(row, away) / size) as Vec3
+  }
+}
+
+function cross(a: Vec3, b: Vec3): Vec3 {
+  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+function dot(a: Vec3, b: Vec3): number {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
 /** Number of a voxel in a volume whose first axis runs fastest, as in NIfTI. */
 export function voxelNumber(grid: Grid, index: Vec3): number {
   return index[0] + grid.shape[0] * (index[1] + grid.shape[1] * index[2])

@@ -174,7 +174,7 @@ export const T = {
 
   draw: {
     title: 'Draw',
-    how: 'Outline the object on two or more planes. The surface follows as soon as you lift the pen.',
+    how: 'Outline the object on two or more planes. The surface follows as soon as you lift the pen; the orange line is where it crosses a slice.',
     image: 'Image to draw on',
     imageHint: 'A NIfTI volume; it stays in this browser. Without one the grid is empty.',
     clear: 'New empty grid',

@@ -2,6 +2,7 @@
 
 import { DRAWN } from '../colour'
 import type { Pane, Paint } from '../pane'
+import { type Placed, drawSection } from '../section'
 import type { Grid, Plane } from '../types'
 import type { Drawing } from './drawing'
 import type { Pen, Tool } from './pen'
@@ -13,6 +14,7 @@ export interface Backdrop {
 
 const PEN = '#ffd166'
 const SUGGESTED = '#7bd88f'
+const SURFACE = '#f1a340'
 
 export function backdropOf(values: Float32Array): Backdrop {
   const sorted = sample(values).sort()
@@ -33,9 +35,16 @@ export function paintOf(drawing: Drawing, backdrop: Backdrop | null, pen: () => 
   }
 }
 
-export function drawOver(context: CanvasRenderingContext2D, pane: Pane, pen: Pen, drawing: Drawing, next: Plane | null): void {
+/** What is known beside the drawing itself. */
+export interface Beside {
+  next: Plane | null
+  surface: Placed | null
+}
+
+export function drawOver(context: CanvasRenderingContext2D, pane: Pane, pen: Pen, drawing: Drawing, beside: Beside): void {
   outline(context, pane, drawing)
-  if (next) suggested(context, pane, next)
+  if (beside.surface) drawSection(context, pane, beside.surface, SURFACE)
+  if (beside.next) suggested(context, pane, beside.next)
   contour(context, pane, pen)
   if (pen.cursor) cursor(context, pane, pen)
 }

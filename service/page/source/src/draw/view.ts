@@ -9,6 +9,7 @@ import { readMz3 } from '../mesh'
 import { readNifti, writeNifti } from '../nifti'
 import { Pane } from '../pane'
 import { dismiss, remember } from '../results'
+import { type Placed, placed } from '../section'
 import { Status } from '../status'
 import { T } from '../text'
 import type { Grid, Plane, Summary } from '../types'
@@ -35,6 +36,7 @@ export class DrawView {
   private backdrop: Backdrop | null = null
   private canvases: Pane[] = []
   private next: Suggestion | null = null
+  private placed: Placed | null = null
   private working = new AbortController()
   private shown: string | null = null
 
@@ -74,15 +76,18 @@ export class DrawView {
   private setDrawing(drawing: Drawing): void {
     this.working.abort()
     this.drawing = drawing
-    this.next = null
     this.canvases = PLANES.map((name) => this.pane(name, drawing))
     replace(this.panes, ...this.canvases.map((pane) => pane.element))
-    for (const pane of this.canvases) pane.draw()
+    this.clearSurface()
+    this.tellSteps()
+  }
+
+  private clearSurface(): void {
+    this.next = this.placed = null
     this.look.element.hidden = true
     void this.surface.show(null, this.look.begin(null, false))
-    replace(this.look.legend)
     replace(this.told)
-    this.tellSteps()
+    for (const pane of this.canvases) pane.draw()
   }
 
   private pane(name: (typeof PLANES)[number], drawing: Drawing): Pane {
@@ -90,7 +95,7 @@ export class DrawView {
     const pen = new Pen(pane, () => this.tool, (where, voxels, value) => this.commit(where, voxels, value))
     pane.show(
       paintOf(drawing, this.backdrop, () => pen, () => this.tool),
-      (context) => drawOver(context, pane, pen, drawing, this.next?.plane ?? null),
+      (context) => drawOver(context, pane, pen, drawing, { next: this.next?.plane ?? null, surface: this.placed }),
     )
     return pane
   }
@@ -121,6 +126,7 @@ export class DrawView {
     const { signal } = this.working
     const planes = drawing.annotated
     if (planes.length < FEWEST_PLANES || !drawing.labels.some((label) => label > 0)) {
+      this.clearSurface()
       this.status.say(planes.length === 0 ? T.draw.onEmpty : T.draw.oneMore)
       return
     }
@@ -145,6 +151,8 @@ export class DrawView {
     const scale = surface.scalars && scaleFromZero(surface.scalars)
     const look = this.look.begin(scale && { name: T.figures.sdShort, label: T.figures.sdLegend, unit: 'mm', scale }, false)
     await this.surface.show(surface, look)
+    this.placed = placed(surface, this.drawing!.grid)
+    for (const pane of this.canvases) pane.draw()
     this.look.element.hidden = false
     replace(this.told, ...this.findings(summary))
   }
