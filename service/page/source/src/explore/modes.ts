@@ -90,6 +90,12 @@ export class Modes {
     this.rest = window.setTimeout(() => void this.fetch(1), REST_MS)
   }
 
+  /** Colours keep their meaning while sliders move; the scale only ever grows. */
+  private widen(distances: Float32Array): void {
+    const wanted = scaleAroundZero(distances)
+    if (wanted.high > this.scale.high) this.scale = wanted
+  }
+
   private async fetch(coarser: number): Promise<void> {
     const model = this.model!
     this.working.abort()
@@ -99,7 +105,7 @@ export class Modes {
     for (const [rank, sd] of this.coordinates) if (sd !== 0) query.append('mode', `${rank}:${sd}`)
     try {
       const surface = readMz3(await this.api.bytes(`v1/models/${encodeURIComponent(model.name)}/shape?${query}`, signal))
-      if (surface.scalars) this.scale = scaleAroundZero(surface.scalars)
+      if (surface.scalars) this.widen(surface.scalars)
       replace(this.legendPlace, surface.scalars && legend(this.scale, T.modes.legend, 'mm'))
       await this.view.show(surface, { ...PLAIN_LOOK, scale: surface.scalars && this.scale }, null, frame(model.half_extent_mm))
       if (coarser === 1) this.told.textContent = this.coordinates.size > 0 ? T.modes.fine : ''
