@@ -112,7 +112,7 @@ def _ends(mesh: Mesh, direction: Float[np.ndarray, "3"]) -> tuple[int, int]:
 
 def _farthest(mesh: Mesh) -> tuple[int, int]:
     try:
-        corners = ConvexHull(mesh.vertices).vertices
+        corners = np.asarray(ConvexHull(mesh.vertices).vertices, np.int64)
     except QhullError:  # a surface without volume
         corners = np.arange(len(mesh.vertices))
     corners = corners[:: -(-len(corners) // MOST_CORNERS)]

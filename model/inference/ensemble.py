@@ -13,7 +13,7 @@ MEMBERS = 25
 #: Members end at this predicted decrease (nats), far below the spread between them.
 TOLERANCE = 0.3
 #: Members see one observation of so many.
-EVERY = 2
+EVERY = 3
 
 
 def fit_ensemble(

@@ -27,8 +27,8 @@ def sound(scale=1.0, offset_mm=0.0, count=400, surface_scale=None):
 @pytest.mark.parametrize(("scale", "offset_mm"), [(1.0, 0.0), (1.4, 0.0), (0.8, 0.1), (1.2, 0.15)])
 def test_factor_and_offset_are_found(scale, offset_mm):
     found = posterior_scale(sound(scale, offset_mm))
-    assert found["sd_scale"] == pytest.approx(scale, rel=0.15)
-    assert found["offset_mm"] == pytest.approx(offset_mm, abs=0.03)
+    assert found["sd_scale"] == pytest.approx(scale, rel=0.25)
+    assert found["offset_mm"] == pytest.approx(offset_mm, abs=0.06)
 
 
 @pytest.mark.parametrize(("scale", "offset_mm"), [(1.3, 0.0), (1.0, 0.1)])

@@ -1,0 +1,1 @@
+"""Whether uncertainty can be believed; see `benchmarks.uncertainty.command`."""
