@@ -75,11 +75,11 @@ class SparseLattice:
 
     def _places(self, cells: Nodes, *offsets: Sequence[int]) -> tuple[Addresses, Addresses]:
         """Brick of the table, and place in the brick, of each offset node."""
-        brick: Addresses = np.zeros(1, np.int64)
-        place: Addresses = np.zeros(1, np.int64)
+        brick: Addresses = np.zeros(1, np.int32)
+        place: Addresses = np.zeros(1, np.int32)
         for axis, offset in enumerate(offsets):
             shape = [-1 if other == axis else 1 for other in range(3)]
-            nodes = cells[:, axis].reshape(-1, 1, 1, 1) + np.asarray(offset).reshape(shape)
+            nodes = cells[:, axis].astype(np.int32).reshape(-1, 1, 1, 1) + np.asarray(offset, np.int32).reshape(shape)
             stride = int(np.prod(self._bricks[axis + 1 :]))
             brick = brick + ((nodes >> BITS) + 1) * stride
             place = place + ((nodes & _REST) << (2 - axis) * BITS)

@@ -44,8 +44,9 @@ class SurfaceSpread:
 
     def sd_of(self, slope: Float[np.ndarray, "v"]) -> float:
         """SD of a figure that changes by ``slope_v`` for a mm of outward movement of vertex v."""
-        variance = float(np.square(slope @ self.factors).sum())
-        if self.local is not None:
-            reach = slope * self.local.reach
-            variance += self.local.discrepancy.functional_variance(self.local.canonical, reach)
+        moved = np.flatnonzero(slope)
+        variance = float(np.square(slope[moved] @ self.factors[moved]).sum())
+        if self.local is not None and moved.size:
+            reach = slope[moved] * self.local.reach[moved]
+            variance += self.local.discrepancy.functional_variance(self.local.canonical[moved], reach)
         return float(np.sqrt(variance))

@@ -4,8 +4,9 @@ The score is the mean over drawings of the mean average surface distance. Traini
 """
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -28,21 +29,27 @@ PRECISIONS = (0.05, 0.2, 0.5)
 SHARES = (0.95, 0.98, 0.99)
 CLIPS_MM = (10.0, 5.0, 20.0)
 #: Validation cases that are scored, evenly spaced.
-SCORED_CASES = 6
+SCORED_CASES = 3
 #: Raised when the way of learning or choosing changes, so that kept results are made anew.
-VERSION = 1
+VERSION = 2
 
 
 def choose(cohort: Cohort) -> ChosenModes:
     """Learn on the training cases and choose on the validation cases."""
     drawn = [(case, drawing) for case in spread(cohort.validation, SCORED_CASES) for drawing in drawings_of(case)]
-    modes, settings = learn_modes(cohort.train, CLIPS_MM[0]), FitSettings()
+    modes = {CLIPS_MM[0]: learn_modes(cohort.train, CLIPS_MM[0])}
+
+    @cache
+    def scored(clip: float, settings: FitSettings) -> float:
+        return score(modes[clip], settings, drawn)
+
+    settings = FitSettings()
     for name, candidates in (("width_mm", WIDTHS_MM), ("precision", PRECISIONS), ("share", SHARES)):
         trials = [replace(settings, **{name: value}) for value in candidates]
-        settings = _best(trials, lambda one: score(modes, one, drawn))
-    others = [learn_modes(cohort.train, clip) for clip in CLIPS_MM[1:]]
-    best = _best([modes, *others], lambda one: score(one, settings, drawn))
-    return ChosenModes(best.reduced(settings.share), settings)
+        settings = min(trials, key=partial(scored, CLIPS_MM[0]))
+    modes |= {clip: learn_modes(cohort.train, clip) for clip in CLIPS_MM[1:]}
+    clip = min(CLIPS_MM, key=lambda one: scored(one, settings))
+    return ChosenModes(modes[clip].reduced(settings.share), settings)
 
 
 def score(modes: DistanceModes, settings: FitSettings, drawn: Sequence[tuple[Case, SliceStacks]]) -> float:
@@ -84,7 +91,3 @@ def spread(values: Sequence[T], count: int) -> list[T]:
     if count >= len(values):
         return list(values)
     return [values[int(place)] for place in np.linspace(0, len(values) - 1, count).round()]
-
-
-def _best(candidates: Sequence[T], score_of: Callable[[T], float]) -> T:
-    return min(candidates, key=score_of)

@@ -35,6 +35,8 @@ GROUP_SHARE = 0.8
 NEAREST = 96
 #: Size of the cells whose points have these in common, in shortest lengths.
 PATCH_SHARE = 3.0
+#: Of so few points a functional is computed as it stands.
+FEW = 32
 #: Evaluations of the covariance in one piece; bounds memory.
 PIECE = 1 << 22
 
@@ -124,8 +126,11 @@ class Discrepancy:
     def functional_variance(self, canonical: Float[np.ndarray, "m 3"], weights: Float[np.ndarray, "m"]) -> float:
         """Posterior variance of ``sum_m weights_m delta(u_m)`` (square of the weights' unit times mm^2).
 
-        For what the contours explain, points closer than the process can tell apart are taken together.
+        Of many points those closer than the process can tell apart are taken together for what the contours explain.
         """
+        if len(canonical) <= FEW:
+            prior = float(weights @ self.covariance.between(canonical, canonical) @ weights)
+            return max(0.0, prior - float(np.square(self.whitened(canonical) @ weights).sum()))
         cells = cells_of(canonical, GROUP_SHARE * min(self.covariance.lengths))
         total = np.bincount(cells, weights).astype(np.float32)
         seen = self.covariance.between(self.points, means_of(cells, canonical)) @ total

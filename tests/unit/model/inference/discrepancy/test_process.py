@@ -84,6 +84,13 @@ def test_variance_of_a_weighted_sum():
     assert PROCESS.functional_variance(PLACES, weights) == pytest.approx(weights @ posterior @ weights, rel=0.15)
 
 
+def test_variance_of_a_sum_over_few_points_is_exact():
+    places, weights = PLACES[:2], np.array([0.7, -1.0])
+    cross = written_out(places, POINTS)
+    posterior = written_out(places, places) - cross @ np.linalg.solve(GRAM, cross.T)
+    assert PROCESS.functional_variance(places, weights) == pytest.approx(weights @ posterior @ weights, rel=0.01)
+
+
 def test_field_is_the_decoders_where_nothing_was_observed_and_near_its_surface():
     logits = np.linspace(-1.0, 1.0, 20)
     far = np.tile([300.0, 0.0, 0.0], (20, 1))
