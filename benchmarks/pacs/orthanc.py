@@ -1,6 +1,7 @@
 """Orthanc with its DICOMweb plugin (Debian: orthanc, orthanc-dicomweb) on free ports of this machine."""
 
 import json
+import os
 import shutil
 import signal
 import socket
@@ -17,6 +18,8 @@ import httpx
 TITLE = "ORTHANC"
 #: Where dcmtk is: pynetdicom brings a program called storescu too, with other options.
 SYSTEM_PATH = "/usr/local/bin:/usr/bin:/bin"
+#: Programs of dcmtk, and Orthanc, gather short segments unless this says otherwise; each then waits for 40 ms.
+PROMPT = {"TCP_NODELAY": "1"}
 PLUGIN = Path("/usr/share/orthanc/plugins/libOrthancDicomWeb.so")
 START_LIMIT_S, STOP_LIMIT_S = 60.0, 30.0
 #: Forwards drawings, but not results, to the service.
@@ -89,7 +92,8 @@ def running_orthanc(
     settings = folder / "orthanc.json"
     settings.write_text(json.dumps(_settings(folder, ports, service_dicom_port, service_http_port, script)))
     with (folder / "orthanc.log").open("ab") as log:
-        process = subprocess.Popen([shutil.which("Orthanc") or "Orthanc", settings], stdout=log, stderr=log)
+        command = [shutil.which("Orthanc") or "Orthanc", settings]
+        process = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, **PROMPT})
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{ports[0]}", timeout=60.0) as client:
             _wait_until_ready(client, process)
@@ -148,4 +152,4 @@ def send(files: list[Path] | Path, port: int, title: str = TITLE, caller: str = 
     program = shutil.which("storescu", path=SYSTEM_PATH) or "storescu"
     # By itself it proposes a fixed list of classes, in which segmentations are missing.
     command = [program, "--required", "-aec", title, "-aet", caller, "127.0.0.1", str(port)]
-    subprocess.run([*command, *what], check=True, capture_output=True)
+    subprocess.run([*command, *what], check=True, capture_output=True, env={**os.environ, **PROMPT})

@@ -13,6 +13,7 @@ from pynetdicom import AE, StoragePresentationContexts, build_role, evt
 from service.adapters.dicom.objects import quiet
 from service.adapters.pacs import sop_classes
 from service.adapters.pacs.configuration import Archive
+from service.adapters.pacs.prompt_sockets import PROMPT
 from service.adapters.pacs.tls import client_context
 from service.errors import ArchiveRefused, ArchiveUnavailable
 from service.job_ports import BlobStore
@@ -48,9 +49,6 @@ class DimseArchive:
         """Headers of a series; none when the archive does not have it."""
         query = Dataset()
         query.QueryRetrieveLevel, query.StudyInstanceUID, query.SeriesInstanceUID = "SERIES", study, series
-        with self._associated([sop_classes.FIND]) as peer:  # archives fail to get what they do not have
-            if not self._matches(peer, query):
-                return []
         return self._get(query) if self._archive.move is None else self._move(query)
 
     def store(self, objects: Sequence[Dataset]) -> None:
@@ -77,8 +75,10 @@ class DimseArchive:
         found: list[Dataset] = []
         handlers = [(evt.EVT_C_STORE, _collect(found))]
         roles = [build_role(uid, scp_role=True) for uid in sop_classes.IMAGES]
-        with self._associated([sop_classes.GET, *sop_classes.IMAGES], roles=roles, handlers=handlers) as peer:
-            _finish(peer.send_c_get(query, sop_classes.GET))
+        contexts = [sop_classes.FIND, sop_classes.GET, *sop_classes.IMAGES]
+        with self._associated(contexts, roles=roles, handlers=handlers) as peer:
+            if self._matches(peer, query):  # archives fail to get what they do not have
+                _finish(peer.send_c_get(query, sop_classes.GET))
         return found
 
     def _move(self, query: Dataset) -> list[Dataset]:
@@ -87,12 +87,12 @@ class DimseArchive:
         found: list[Dataset] = []
         entity: Any = AE(ae_title=target.ae_title)
         entity.supported_contexts = StoragePresentationContexts
-        server = entity.start_server(
-            (target.host, target.port), block=False, evt_handlers=[(evt.EVT_C_STORE, _collect(found))]
-        )
+        handlers = [PROMPT, (evt.EVT_C_STORE, _collect(found))]
+        server = entity.start_server((target.host, target.port), block=False, evt_handlers=handlers)
         try:
-            with self._associated([sop_classes.MOVE]) as peer:
-                _finish(peer.send_c_move(query, target.ae_title, sop_classes.MOVE))
+            with self._associated([sop_classes.FIND, sop_classes.MOVE]) as peer:
+                if self._matches(peer, query):
+                    _finish(peer.send_c_move(query, target.ae_title, sop_classes.MOVE))
         finally:
             server.shutdown()
         return found
@@ -136,13 +136,13 @@ class DimseArchive:
         raise ArchiveUnavailable("The archive has not reported on its storage commitment.")
 
     @contextmanager
-    def _associated(self, contexts: Sequence[str], **more: object) -> Iterator[Any]:
+    def _associated(self, contexts: Sequence[str], **more: Any) -> Iterator[Any]:
         entity: Any = AE(ae_title=self._archive.local_ae_title)
         entity.acse_timeout = entity.dimse_timeout = entity.network_timeout = self._archive.timeout_s
         entity.connection_timeout = self._archive.timeout_s
         for context in contexts:
             entity.add_requested_context(context, list(sop_classes.PROPOSED_SYNTAXES))
-        options = {"ext_neg": more.get("roles"), "evt_handlers": more.get("handlers") or []}
+        options = {"ext_neg": more.get("roles"), "evt_handlers": [PROMPT, *(more.get("handlers") or [])]}
         if self._archive.tls is not None:
             options["tls_args"] = (client_context(self._archive.tls), self._archive.host)
         peer = entity.associate(

@@ -15,6 +15,7 @@ from service.adapters.pacs import sop_classes
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome
 from service.adapters.pacs.configuration import Listener
 from service.adapters.pacs.dimse_client import commitment_key
+from service.adapters.pacs.prompt_sockets import PROMPT
 from service.adapters.pacs.tls import server_context
 from service.job_ports import BlobStore
 from service.pacs_ports import Disposition, ObjectReceiver
@@ -37,6 +38,7 @@ def dimse_listener(
     entity.add_supported_context(sop_classes.COMMITMENT, scu_role=True, scp_role=True)
     desk = _Desk(listener, receiver, blobs, audit, log)
     handlers: list[Any] = [
+        PROMPT,
         (evt.EVT_C_ECHO, lambda event: SUCCESS),
         (evt.EVT_C_STORE, desk.store),
         (evt.EVT_N_EVENT_REPORT, desk.report),
