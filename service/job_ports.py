@@ -7,10 +7,21 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Protocol
 
+from model.interruption import Check
+
+__all__ = [
+    "BlobStore",
+    "Check",
+    "JobEngine",
+    "JobKind",
+    "JobRun",
+    "JobState",
+    "JobStatus",
+    "Record",
+]
+
 #: JSON values: names, numbers, keys of files and digests. Arrays and images lie in a `BlobStore`, never here.
 Record = Mapping[str, Any]
-#: Raises `Cancelled` once nobody wants the job any more; call it between items.
-Check = Callable[[], None]
 
 
 class JobState(StrEnum):
@@ -94,7 +105,8 @@ class JobKind:
     Attributes:
         follow: the course of a job with its argument. Run again from the start after a restart, with every answer of
             `JobRun` remembered, so it must do the same each time: no clock, no randomness, no files but in steps.
-        parts: the work itself. Idempotent: the same item leads to the same files and the same answer.
+        parts: the work itself. Idempotent: the same item leads to the same files and the same answer. Its check raises
+            `Cancelled` once nobody wants the job any more; call it between items, or give it to what takes long.
     """
 
     name: str

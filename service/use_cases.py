@@ -22,6 +22,7 @@ from model.inference.reconstruction import reconstruct as infer
 from model.inference.sampling import SampledShape, draw_shape
 from model.inference.surface import covering_grid
 from model.inference.uncertainty import ShapeState, occupancy, voxel_entropy
+from model.interruption import Check, interruptible
 from service.errors import NotComputed
 from service.ports import Catalogue, Outcome, ResultStore, StoredResult
 
@@ -33,13 +34,23 @@ SURFACE_SD = "surface_sd_mm"
 MAX_SEED = 2**53 - 1
 
 
-def reconstruct(model: ShapeModel, stacks: tuple[MaskStack, ...], options: Options, watch: Watch) -> Outcome:
+def reconstruct(
+    model: ShapeModel,
+    stacks: tuple[MaskStack, ...],
+    options: Options,
+    watch: Watch = lambda stage: None,
+    check: Check = lambda: None,
+) -> Outcome:
     """Reconstruct the object of the stacks; the first one's grid is the input's grid.
+
+    Args:
+        watch: told the name of each stage as it begins.
+        check: called many times a second; what it raises ends the work.
 
     Raises:
         InputError: the stacks or options cannot be used; the sentence says why.
     """
-    reconstruction = infer(model, stacks, options, watch)
+    reconstruction = infer(interruptible(model, check), stacks, options, watch)
     manifest = model.manifest
     return Outcome(manifest.name, manifest.version, model.digest, options, stacks[0].grid, reconstruction)
 

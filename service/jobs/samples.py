@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from model.interruption import interruptible
 from service.adapters.sample_files import Draw, SampleWriter, manifest_bytes
 from service.job_ports import Check, JobKind, JobRun, Record
 from service.jobs.tools import JobTools
@@ -32,7 +33,7 @@ def _follow(run: JobRun, argument: Record) -> Record:
 
 def _draw(tools: JobTools, item: Record, check: Check) -> Record:
     files, how = tools.files(item["job"]), _how(tools, item)
-    model = tools.registry.get(item["model"])
+    model = interruptible(tools.registry.get(item["model"]), check)
     writer = SampleWriter(tools.write_mesh, tools.write_volume)
     made = 0
     for number in range(item["first"], item["first"] + item["size"]):

@@ -1,4 +1,4 @@
-"""Work for a client that may go away: what has not begun is dropped, what runs stops at its next stage."""
+"""Work for a client that may go away: what has not begun is dropped, what runs stops at its next evaluation."""
 
 import asyncio
 import threading

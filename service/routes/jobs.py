@@ -109,7 +109,7 @@ def read_job(identifier: Identifier, request: Request, services: WithServices) -
 
 
 def end_job(identifier: Identifier, request: Request, services: WithServices) -> Response:
-    """What runs stops within a second or at the end of its present stage; a job that had ended is forgotten."""
+    """What runs stops within a second; a job that had ended is forgotten."""
     if services.jobs.status(identifier).state.is_final:
         JobFiles(services.blobs, identifier).remove()
         services.jobs.forget(identifier)

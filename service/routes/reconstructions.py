@@ -1,5 +1,6 @@
 """``POST /v1/reconstructions``: masks in, a summary or a surface out."""
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Form, Request
@@ -110,7 +111,7 @@ def _reconstruct(services: Services, form: ReconstructionForm, watch: Watch) -> 
         watch(stage)
         timer(stage)
 
-    outcome = use_cases.reconstruct(model, stacks, options, observed)
+    outcome = use_cases.reconstruct(model, stacks, options, observed, partial(watch, "evaluation"))
     timer.finish()
     return services.store.save(outcome)
 
