@@ -1,7 +1,7 @@
 """A model whose work can be ended from outside: each evaluation of its decoder passes a check first.
 
-All long work, whether fit, ensemble, surface, uncertainty or sampling, is many evaluations of some tenths of a second at
-most. So what a check raises ends any of it soon, and none of it has to know of who asks for that.
+All long work, whether fit, ensemble, surface, uncertainty or sampling, is many evaluations of some tenths of a second
+at most. So what a check raises ends any of it soon, and none of it has to know of who asks for that.
 """
 
 from collections.abc import Callable

@@ -9,10 +9,11 @@
         ├── Unauthorised           no key, or a wrong one
         ├── NotAcceptable          none of the accepted media types can be made
         ├── UnsupportedMediaType   the body's media type is not read
-    ├── ArchiveUnavailable     a picture archive cannot be reached; worth trying again
-    ├── ArchiveRefused         a picture archive does not take a request; not worth trying again
+        ├── ArchiveUnavailable     a picture archive cannot be reached; worth trying again
+        ├── ArchiveRefused         a picture archive does not take a request; not worth trying again
         ├── Abandoned              the client went away while its work was done
         ├── Cancelled              nobody wants the job any more
+        ├── GivenUp                a part of a job that ends its worker again and again
         └── NotReady               a job without a result: not done yet, failed or cancelled
     NotFound
     ├── UnknownJob                 never enqueued, or expired
@@ -73,6 +74,10 @@ class Abandoned(ServiceError):
 
 class Cancelled(ServiceError):
     """Nobody wants the job any more."""
+
+
+class GivenUp(ServiceError):
+    """A part of a job that ends its worker again and again."""
 
 
 class NotReady(ServiceError):
@@ -136,6 +141,7 @@ KINDS: dict[type[MorphoFlowError], Kind] = {
     Abandoned: Kind(499, "abandoned", "The client went away"),
     NotReady: Kind(409, "not-ready", "The job has no result"),
     Cancelled: Kind(409, "cancelled", "The job was cancelled"),
+    GivenUp: Kind(500, "internal-error", "Internal error"),
     ArchiveUnavailable: Kind(500, "internal-error", "Internal error"),
     ArchiveRefused: Kind(500, "internal-error", "Internal error"),
     BundleError: Kind(500, "internal-error", "Internal error"),

@@ -83,6 +83,10 @@ class JobRun(Protocol):
         """Short work that is done once, in the process that follows the job."""
         ...
 
+    def wait(self, seconds: float) -> None:
+        """Let time pass; after a restart, what is left of it."""
+        ...
+
     def spread(self, part: str, items: Sequence[Record], sizes: Sequence[int] | None = None) -> list[Record]:
         """Have a part done for each item by whichever worker is free; the answers in the order of the items.
 
@@ -142,7 +146,7 @@ class JobEngine(Protocol):
         ...
 
     def unfinished(self) -> int:
-        """Jobs that wait or run."""
+        """Jobs that wait or run, less those that wait for archives."""
         ...
 
     def backlog(self) -> int:

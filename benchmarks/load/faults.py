@@ -20,7 +20,8 @@ from pathlib import Path
 import httpx
 import typer
 
-from benchmarks.load.jobs import begin_job
+from benchmarks.load.figures import Figure, at_most, holds, say, told
+from benchmarks.load.jobs import begin_job, wait_for
 from benchmarks.load.traffic import MASK
 from benchmarks.server import Server, serving
 
@@ -31,32 +32,38 @@ _POSTGRES = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
 
 def main() -> None:
     """All of them, one after the other."""
-    clients()
+    say(measure())
+
+
+def measure() -> list[Figure]:
+    """What each fault does to the service."""
+    found = clients()
     if os.geteuid() != 0:
-        print("full disk and PostgreSQL: not run, they want root")
-        return
-    full_disk()
-    if _POSTGRES:
-        database_restart()
+        return [*found, told("full disk and PostgreSQL", "not run, they want root")]
+    return [*found, *full_disk(), *(database_restart() if _POSTGRES else [])]
 
 
-def clients() -> None:
+def clients() -> list[Figure]:
     """Clients that send a byte a second, and clients that go away in the middle."""
     with serving(()) as server:
-        alone_s = answer_s(server)
+        answer_s(server)
+        alone_s = min(answer_s(server) for _ in range(3))
         with slow_clients(server):
-            beside_s = answer_s(server)
-        print(f"{CLIENTS} slow clients: a request takes {beside_s:.2f} s instead of {alone_s:.2f} s")
+            beside_s = min(answer_s(server) for _ in range(3))
         began = time.monotonic()
         for _ in range(CLIENTS):
             vanish(server)
         wait_for(lambda: idle(server), 60.0)
         drained_s = time.monotonic() - began
-        print(f"{CLIENTS} clients vanished: no work of theirs was left after {drained_s:.1f} s", end="; ")
-        print(f"a request takes {answer_s(server):.2f} s")
+        after_s = min(answer_s(server) for _ in range(3))
+    return [
+        at_most(f"a request beside {CLIENTS} slow clients, over alone", beside_s / alone_s, 1.5),
+        at_most(f"work of {CLIENTS} clients that vanished ended after", drained_s, 30.0, " s", 1),
+        at_most("a request afterwards, over alone", after_s / alone_s, 1.5),
+    ]
 
 
-def full_disk() -> None:
+def full_disk() -> list[Figure]:
     """A job meets a full disk, waits, and goes on when there is room."""
     with tempfile.TemporaryDirectory() as folder, small_disk(Path(folder), "6m"):
         settings = {"MORPHOFLOW_RESULTS_FOLDER": f"{folder}/results", "MORPHOFLOW_JOB_WORKERS": "1"}
@@ -68,24 +75,37 @@ def full_disk() -> None:
             before = server.client.get(place).json()
             ballast.unlink()
             after = end_of(server, place)
-        print(f"full disk: {before['state']} with {before['done']} of 8", end="; ")
-        print(f"with room again {after['state']} with {after['done']}")
+    value = f"{before['state']} with {before['done']} of 8, with room again {after['state']} with {after['done']}"
+    return [holds("a job on a full disk", value, "waits, then done", reached=_went_on(before, after, 8))]
 
 
-def database_restart() -> None:
+def database_restart() -> list[Figure]:
     """PostgreSQL stops at once (as if its machine lost power) and comes back in the middle of a job."""
     with own_postgres() as (url, control):
         settings = {"MORPHOFLOW_JOBS_DATABASE": url, "MORPHOFLOW_JOB_WORKERS": "1", "MORPHOFLOW_JOB_NICE": "5"}
         with serving((), settings) as server:
             place = begin_job(server.client, 24)
             wait_for(lambda: server.client.get(place).json()["done"] > 0, 120.0)
+            before = server.client.get(place).json()
             control("stop", "-m", "immediate")
             refused = server.client.get(place).status_code
             served_s = answer_s(server)
             control("start")
             after = end_of(server, place)
-        print(f"PostgreSQL down: jobs answer {refused}, a reconstruction takes {served_s:.2f} s", end="; ")
-        print(f"up again: {after['state']} with {after['done']} of 24")
+    return [
+        holds("jobs while PostgreSQL is down", str(refused), "503", reached=refused == 503),
+        told("a reconstruction while it is down", f"{served_s:.2f} s"),
+        holds(
+            "the job when it is up again",
+            f"{after['state']} with {after['done']} of 24",
+            "done",
+            reached=_went_on(before, after, 24),
+        ),
+    ]
+
+
+def _went_on(before: dict[str, object], after: dict[str, object], count: int) -> bool:
+    return before["state"] in ("queued", "running") and after["state"] == "done" and after["done"] == count
 
 
 def answer_s(server: Server) -> float:
@@ -154,13 +174,6 @@ def end_of(server: Server, place: str) -> dict[str, object]:
     wait_for(over, 180.0)
     found: dict[str, object] = server.client.get(place).json()
     return found
-
-
-def wait_for(condition: Callable[[], bool], limit_s: float) -> None:
-    """Until something holds, but no longer than so."""
-    limit = time.monotonic() + limit_s
-    while not condition() and time.monotonic() < limit:
-        time.sleep(0.2)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.load.figures import Figure, at_most, holds, say, told
 from benchmarks.load.jobs import begin_job
 from benchmarks.server import Server, serving
 
@@ -25,6 +26,11 @@ def main(
     workers: Annotated[int, typer.Option(min=1, help="Worker processes.")] = 2,
 ) -> None:
     """Kill workers in the middle of a job."""
+    say(measure(count, kills, workers))
+
+
+def measure(count: int, kills: int, workers: int) -> list[Figure]:
+    """What a job delivers whose workers are killed."""
     settings = {"MORPHOFLOW_JOB_WORKERS": str(workers), "MORPHOFLOW_LOG_LEVEL": "debug", "MORPHOFLOW_JOB_NICE": "5"}
     with serving((), settings) as server:
         place = begin_job(server.client, count)
@@ -33,6 +39,7 @@ def main(
         while (job := server.client.get(place).json())["state"] in ("queued", "running"):
             if killed < kills and job["done"] > (killed + 0.5) * count / (kills + 1):
                 killed += kill_one(server)
+                typer.echo(f"{killed} killed, {job['done']} of {count} shapes done")
             time.sleep(0.1)
         archive = zipfile.ZipFile(io.BytesIO(server.client.get(f"{place}/result").content))
         begun = items_begun(server.log)
@@ -40,9 +47,14 @@ def main(
     manifest = json.loads(archive.read("manifest.json"))["samples"]
     names = [name for name in archive.namelist() if name != "manifest.json"]
     missing = set(range(count)) - {entry["seed"] for entry in manifest}
-    print(f"{killed} workers killed; the job is {job['state']} after {seconds:.0f} s")
-    print(f"delivered {len(set(names))} of {count}, {len(names) - len(set(names))} twice, {len(missing)} missing")
-    print(f"done again {begun - count} ({(begun - count) / count:.2%}; to reach: below 5 %)")
+    twice = len(names) - len(set(names))
+    return [
+        holds("workers killed", str(killed), f"{kills}", reached=killed == kills),
+        told("the job", f"is {job['state']} after {seconds:.0f} s"),
+        holds("shapes missing", f"{len(missing)} of {count}", "none", reached=not missing),
+        holds("shapes delivered twice", str(twice), "none", reached=not twice),
+        at_most("work done again", 100.0 * (begun - count) / count, 5.0, " %"),
+    ]
 
 
 def kill_one(server: Server) -> int:

@@ -17,6 +17,7 @@ from typing import Annotated
 import psycopg
 import typer
 
+from benchmarks.load.figures import Figure, at_most, holds, say, told
 from service.adapters.jobs.client import DbosJobs
 from service.ports import SAMPLES_JOB
 
@@ -29,6 +30,11 @@ def main(
     count: Annotated[int, typer.Option(min=4, help="Shapes of each job.")] = 16,
 ) -> None:
     """Kill one of three replicas while all have work."""
+    say(measure(postgres, jobs, count))
+
+
+def measure(postgres: str, jobs: int, count: int) -> list[Figure]:
+    """How soon the others take over."""
     with database(postgres) as url, tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         replicas = {name: stack.enter_context(replica(name, url, Path(folder))) for name in ("a", "b", "c")}
         engine = DbosJobs(url)
@@ -48,9 +54,12 @@ def main(
         )
         waited(lambda: all(engine.status(job).state.is_final for job in places), killed)
         states = [engine.status(job).state.value for job in places]
-        print(f"replica killed with {len(orphans)} jobs and parts; taken over after {taken_s:.1f} s")
-        print(f"its jobs had ended elsewhere after {done_s:.1f} s (to reach: below 30)")
-        print(f"jobs done: {states.count('done')} of {jobs}")
+    finished = states.count("done")
+    return [
+        told("the killed replica's jobs and parts", f"{len(orphans)}, taken over after {taken_s:.1f} s"),
+        at_most("its jobs had ended elsewhere after", done_s, 30.0, " s", 1),
+        holds("jobs done", f"{finished} of {jobs}", "all", reached=finished == jobs),
+    ]
 
 
 @contextmanager

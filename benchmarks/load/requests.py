@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.load.figures import Figure, at_least, at_most, holds, say, told
 from benchmarks.load.traffic import MASK, send
 from benchmarks.server import serving
 from model.inference.reconstruction import Options
@@ -32,6 +33,11 @@ def main(
     load: Annotated[float, typer.Option(min=0.1, max=1.0, help="Share of the throughput.")] = 0.8,
 ) -> None:
     """Throughput and latency of reconstructions (without uncertainty)."""
+    say(measure(duration_s, cores, load))
+
+
+def measure(duration_s: float, cores: int, load: float = 0.8) -> list[Figure]:
+    """The service under full load, and under a share of it."""
     alone_s = computing_s(repeats=10)
     with serving((), {"MORPHOFLOW_WORKERS": str(cores), "MORPHOFLOW_MAX_WAITING": "64"}) as server:
         send(server, users=cores, duration_s=5.0)
@@ -41,12 +47,15 @@ def main(
         paced = send(server, users=USERS, rate=load * full.rate, duration_s=duration_s)
     ceiling = cores / alone_s
     median_s, p99_s = paced.quantile_s(0.5), paced.quantile_s(0.99)
-    print(f"computation alone     {alone_s:8.3f} s of CPU, so at most {ceiling:.2f} requests a second on {cores} cores")
-    print(f"sustained throughput  {full.rate:8.2f} 1/s, {full.failed} failed; {spent_s:.3f} s of CPU for each request")
-    print(f"  of the ceiling      {full.rate / ceiling:8.2f} (to reach: 0.90)")
-    print(f"at {load:.0%} of it         {paced.rate:8.2f} 1/s, {paced.failed} failed", end="; ")
-    print(f"median {median_s:.3f} s, p99 {p99_s:.3f} s")
-    print(f"  p99 / median        {p99_s / median_s:8.2f} (to reach: below 3)")
+    return [
+        told("computation of one request", f"{alone_s:.3f} s of CPU: at most {ceiling:.2f} a second on {cores} cores"),
+        told("CPU of the service for one request", f"{spent_s:.3f} s"),
+        told("sustained throughput", f"{full.rate:.2f} a second"),
+        at_least("  of what the computation allows", full.rate / ceiling, 0.9),
+        told(f"at {load:.0%} of it", f"{paced.rate:.2f} a second; median {median_s:.3f} s, p99 {p99_s:.3f} s"),
+        at_most("  p99 over median", p99_s / median_s, 3.0),
+        holds("requests that failed", str(full.failed + paced.failed), "none", reached=not full.failed + paced.failed),
+    ]
 
 
 def computing_s(repeats: int) -> float:

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,20 +34,28 @@ class Traffic:
         return float(np.quantile(self.seconds, share, method="higher")) if self.seconds else float("nan")
 
 
-def send(server: Server, *, users: int, rate: float = 0.0, duration_s: float, uncertainty: str = "none") -> Traffic:
-    """Let so many users send masks; `rate` of all of them together (1/s), 0 for one request after the other."""
+def send(server: Server, *, users: int, rate: float = 0.0, duration_s: float, kind: str = "none") -> Traffic:
+    """Let so many users send requests; `rate` of all of them together (1/s), 0 for one request after the other.
+
+    Args:
+        kind: uncertainty of the reconstructions, or ``mixed`` for requests of every kind.
+    """
     command = [sys.executable, "-m", "locust", "-f", str(_USERS), "--headless", "--json", "--skip-log"]
     command += ["-u", str(users), "-r", str(users), "-t", f"{duration_s:.0f}s", "-H", str(server.client.base_url)]
-    environment = {
-        **os.environ,
-        "LOAD_MASK": str(MASK.resolve()),
-        "LOAD_RATE": str(rate / users),
-        "LOAD_UNCERTAINTY": uncertainty,
-    }
-    done = subprocess.run([*command, "--stop-timeout", "60"], env=environment, check=False, capture_output=True)
-    if not done.stdout.strip():
-        raise SystemExit(f"locust did not run: {done.stderr.decode(errors='replace')[-500:]}")
-    (entry,) = json.loads(done.stdout)
-    seconds = [float(ms) / 1000.0 for ms, count in entry["response_times"].items() for _ in range(count)]
-    span_s = max(entry["last_request_timestamp"] - entry["start_time"], 1e-9)
-    return Traffic(tuple(seconds), entry["num_failures"], span_s)
+    with tempfile.TemporaryDirectory() as folder:
+        times = Path(folder) / "times.json"
+        environment = {
+            **os.environ,
+            "LOAD_MASK": str(MASK.resolve()),
+            "LOAD_RATE": str(rate / users),
+            "LOAD_USERS": str(users),
+            "LOAD_KIND": kind,
+            "LOAD_TIMES": str(times),
+        }
+        done = subprocess.run([*command, "--stop-timeout", "60"], env=environment, check=False, capture_output=True)
+        if not done.stdout.strip() or not times.exists():
+            raise SystemExit(f"locust did not run: {done.stderr.decode(errors='replace')[-500:]}")
+        entries, seconds = json.loads(done.stdout), json.loads(times.read_text())
+    first = min(entry["start_time"] for entry in entries)
+    span_s = max(max(entry["last_request_timestamp"] for entry in entries) - first, 1e-9)
+    return Traffic(tuple(seconds), sum(entry["num_failures"] for entry in entries), span_s)

@@ -1,28 +1,70 @@
-"""What locust runs: users that send one mask again and again and read its surface.
+"""What locust runs: users that send requests made beforehand, as cheaply as can be, and keep each answer's time.
 
-The environment says how: LOAD_MASK (file), LOAD_RATE (requests a second of each user, 0 for as many as are answered)
-and LOAD_UNCERTAINTY.
+The environment says how: LOAD_MASK (file), LOAD_RATE (requests a second of each user, 0 for as many as are answered),
+LOAD_USERS, LOAD_KIND (`none`, `laplace`: reconstructions; `mixed`: of every kind that the service answers) and
+LOAD_TIMES (file that the times of answers (s) are written to at the end).
 """
 
+import itertools
+import json
 import os
 from pathlib import Path
-from types import MappingProxyType
 
-from locust import HttpUser, constant_throughput, task
+import gevent
+from locust import FastHttpUser, constant_throughput, events, task
+from urllib3 import encode_multipart_formdata
 
-RATE = float(os.environ.get("LOAD_RATE", "0"))
+RATE, USERS = float(os.environ.get("LOAD_RATE", "0")), int(os.environ.get("LOAD_USERS", "1"))
+KIND = os.environ.get("LOAD_KIND", "none")
+TIMES: list[float] = []
 
 
-class Caller(HttpUser):
-    """Sends a mask, reads the surface."""
+def prepared(accept: str, **form: str) -> tuple[bytes, dict[str, str]]:
+    """Body and headers of a request to reconstruct."""
+    mask = ("mask.nii.gz", Path(os.environ["LOAD_MASK"]).read_bytes(), "application/gzip")
+    body, kind = encode_multipart_formdata({"mask": mask, **form})
+    return body, {"Content-Type": kind, "Accept": accept}
 
-    content = Path(os.environ["LOAD_MASK"]).read_bytes()
-    form = MappingProxyType({"uncertainty": os.environ.get("LOAD_UNCERTAINTY", "none")})
+
+PLAIN = prepared("model/stl", uncertainty="none")
+LAPLACE = prepared("model/stl", uncertainty="laplace")
+COARSE = prepared("application/json", uncertainty="none", resolution_mm="4")
+SURE = prepared("application/x-ply", uncertainty="laplace", resolution_mm="4")
+#: Requests in turn: most are the smallest that the service answers, all kinds are among them.
+TURNS = {"none": [PLAIN], "laplace": [LAPLACE], "mixed": [*[COARSE] * 8, SURE, None]}[KIND]
+
+
+@events.request.add_listener
+def _keep(response_time: float, exception: BaseException | None, **_: object) -> None:
+    if exception is None:
+        TIMES.append(response_time / 1000.0)
+
+
+@events.quitting.add_listener
+def _write(**_: object) -> None:
+    Path(os.environ["LOAD_TIMES"]).write_text(json.dumps(TIMES))
+
+
+class Caller(FastHttpUser):
+    """Sends one request after the other, or one at each beat; the beats of all users are evenly apart."""
+
+    numbers = itertools.count()
+    network_timeout = connection_timeout = 120.0
     if RATE:
         wait_time = constant_throughput(RATE)
 
+    def on_start(self) -> None:
+        """Wait for the own place among the beats."""
+        self.turn = next(self.numbers)
+        if RATE:
+            gevent.sleep(self.turn / (RATE * USERS))
+
     @task
-    def reconstruct(self) -> None:
+    def ask(self) -> None:
         """One request."""
-        files = {"mask": ("mask.nii.gz", self.content, "application/gzip")}
-        self.client.post("/v1/reconstructions", data=dict(self.form), files=files, headers={"Accept": "model/stl"})
+        request = TURNS[self.turn % len(TURNS)]
+        self.turn += 1
+        if request is None:
+            self.client.get(f"/v1/models/hippocampus/samples/{self.turn}?format=stl&spacing_mm=3", name="sample")
+        else:
+            self.client.post("/v1/reconstructions", data=request[0], headers=request[1])

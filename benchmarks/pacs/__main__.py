@@ -28,9 +28,10 @@ def _storm(
     studies: Annotated[int, typer.Option(min=1)] = 500,
     kills: Annotated[int, typer.Option(min=0)] = 10,
     seed: Annotated[int, typer.Option(help="Decides when the service is killed.")] = 0,
+    direct: Annotated[bool, typer.Option("--direct", help="Send to the service, not to the archive.")] = False,
 ) -> None:
     """Many studies at once, the service killed on the way."""
-    count = storm(folder, studies, kills, seed, typer.echo)
+    count = storm(folder, studies, kills, seed, typer.echo, direct=direct)
     typer.echo(count.sentence(studies))
 
 

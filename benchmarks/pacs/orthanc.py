@@ -55,6 +55,19 @@ class Orthanc:
         found = self.client.post("/tools/find", json=query).raise_for_status().json()
         return [{**item["MainDicomTags"], "ID": item["ID"], "ParentSeries": item["ParentSeries"]} for item in found]
 
+    def count(self) -> int:
+        """How many objects it holds."""
+        return int(self.client.get("/statistics").raise_for_status().json()["CountInstances"])
+
+    def forwards(self) -> dict[str, str]:
+        """State of each object's forwarding, by its identifier."""
+        found = self.client.get("/jobs", params={"expand": ""}).raise_for_status().json()
+        return {job["ID"]: job["State"] for job in found if job["Type"] == "DicomModalityStore"}
+
+    def forward_again(self, identifier: str) -> None:
+        """Repeat a forwarding that failed."""
+        self.client.post(f"/jobs/{identifier}/resubmit").raise_for_status()
+
     def series(self) -> list[dict[str, str]]:
         """Main tags of every series, with the number of its instances."""
         found = self.client.get("/series", params={"expand": ""}).raise_for_status().json()
@@ -131,6 +144,7 @@ def _settings(
         "DicomWeb": {"Enable": True, "Root": "/dicom-web/", "Servers": {"morphoflow": [service]}},
         "LuaScripts": [str(script)],
         "ConcurrentJobs": 4,
+        "JobsHistorySize": 100_000,
     }
 
 

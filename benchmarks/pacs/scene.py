@@ -20,6 +20,7 @@ from pydicom import Dataset, dcmread
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.load.figures import Figure, at_most, holds
 from benchmarks.pacs.drawings import EXAMPLE, as_seg, placed, real_series, series_around, three_planes
 from benchmarks.pacs.orthanc import BY_DICOMWEB, BY_DIMSE, Orthanc, free_ports, is_installed, running_orthanc, send
 from benchmarks.pacs.stage import Place, by_dicomweb, by_dimse, running_service, write_file
@@ -33,6 +34,8 @@ from training.metrics_masks import dice
 
 DATA = Path("../shared/data")
 LIMITS = ImageLimits(max_bytes=1 << 28, max_voxels=1 << 27)
+#: The results have to be in the archive after so long (s).
+LIMIT_S = 5.0
 #: Longest wait for the results (s).
 PATIENCE_S = 120.0
 #: Largest difference in Dice between what the archive and what REST gives back.
@@ -84,12 +87,25 @@ def play(folder: Path, data: Path = DATA, *, dicomweb: bool = False) -> Scene:
             (drawn,) = _files(folder / "drawing", [drawing])
             began = time.monotonic()
             send([drawn], orthanc.dicom_port)
-            found = _results(orthanc, drawing)
+            _wait_for_objects(orthanc, len(images) + 1 + len(RESULTS))
             seconds = time.monotonic() - began
+            found = _results(orthanc, drawing)
             rest = _by_rest(client, three_planes(whole), grid)
     scene = _judge(seconds, found, whole, rest, grid, folder)
     _show(scene, images, drawing, found)
     return scene
+
+
+def measure(folder: Path, forward: str = BY_DIMSE) -> list[Figure]:
+    """The scene's figures, by DIMSE or by DICOMweb."""
+    scene = play(folder, dicomweb=forward == BY_DICOMWEB)
+    difference = abs(scene.dice_archive - scene.dice_rest)
+    return [
+        at_most("results in the study after", scene.seconds, LIMIT_S, " s", 1),
+        holds("result objects", str(scene.results), f"{len(RESULTS)}", reached=scene.results == len(RESULTS)),
+        holds("errors that the checker finds", str(len(scene.errors)), "none", reached=not scene.errors),
+        at_most("difference in Dice to the result by REST", difference, SAME_DICE, digits=4),
+    ]
 
 
 def _study(data: Path) -> tuple[list[Dataset], Bool[np.ndarray, "i j k"]]:
@@ -118,14 +134,17 @@ def _wait_for_worker(place: Place) -> None:
         time.sleep(0.1)
 
 
-def _results(orthanc: Orthanc, drawing: Dataset) -> list[Dataset]:
-    """The results in the archive, as soon as all are there."""
+def _wait_for_objects(orthanc: Orthanc, count: int) -> None:
+    """Until the archive holds so many objects; asked for seldom enough to leave the machine to those who work."""
     limit = time.monotonic() + PATIENCE_S
-    found: list[dict[str, str]] = []
-    while len(found) < len(RESULTS) and time.monotonic() < limit:
-        time.sleep(0.02)
-        series = {s["ID"] for s in orthanc.series() if "not for primary diagnosis" in s.get("SeriesDescription", "")}
-        found = [item for item in orthanc.instances(drawing.StudyInstanceUID) if item["ParentSeries"] in series]
+    while orthanc.count() < count and time.monotonic() < limit:
+        time.sleep(0.05)
+
+
+def _results(orthanc: Orthanc, drawing: Dataset) -> list[Dataset]:
+    """The results in the archive."""
+    series = {s["ID"] for s in orthanc.series() if "not for primary diagnosis" in s.get("SeriesDescription", "")}
+    found = [item for item in orthanc.instances(drawing.StudyInstanceUID) if item["ParentSeries"] in series]
     return [dcmread(io.BytesIO(orthanc.file(item["ID"]))) for item in found]
 
 

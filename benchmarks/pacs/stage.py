@@ -46,6 +46,7 @@ class Place:
     dicom_port: int
     model: str = "hippocampus"
     models: str = ""
+    workers: int = 1
 
     @property
     def file(self) -> Path:
@@ -65,6 +66,7 @@ class Place:
             "MORPHOFLOW_PACS_FILE": str(self.file),
             "MORPHOFLOW_PORT": str(self.http_port),
             "MORPHOFLOW_JOB_NICE": "0",
+            "MORPHOFLOW_JOB_WORKERS": str(self.workers),
             "MORPHOFLOW_MODELS": self.models,
             "OMP_NUM_THREADS": "1",
         }

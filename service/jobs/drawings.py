@@ -6,10 +6,12 @@ reached is asked again after longer and longer waits, for ever; what cannot be u
 """
 
 import hashlib
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import count
+from threading import BoundedSemaphore
 
 from model.errors import InputError, NotFound
 from model.inference.reconstruction import Options
@@ -21,80 +23,107 @@ from service.adapters.dicom.series import series_of
 from service.adapters.image_guard import ImageLimits
 from service.adapters.pacs.configuration import Rule
 from service.adapters.pacs.delivery import Desk
-from service.errors import ArchiveRefused, ArchiveUnavailable, Cancelled
+from service.errors import ArchiveRefused, ArchiveUnavailable, Cancelled, GivenUp
 from service.job_ports import Check, JobKind, JobRun, Record
 from service.observability import Log
 from service.pacs_ports import DRAWING_JOB
 from service.ports import Catalogue, Outcome
 
-#: Answers of parts.
+#: Answers of stages.
 DONE, AGAIN, MISSING, REFUSED = "done", "again", "missing", "refused"
+#: Exchanges with archives that one worker has at the same time.
+EXCHANGES = 4
 
 
 @dataclass(frozen=True)
 class DrawingTools:
-    """What the job works with."""
+    """What the job works with.
+
+    Attributes:
+        lines: bounds the exchanges with archives at the same time.
+    """
 
     desk: Desk
     registry: Catalogue
     limits: ImageLimits
     version: str
     log: Log
+    lines: AbstractContextManager[object] = field(default_factory=lambda: BoundedSemaphore(EXCHANGES))
 
 
-Work = Callable[[DrawingTools, Record, Check], Record]
-Part = Callable[[Record, Check], Record]
+#: Work of a stage.
+Work = Callable[[DrawingTools, Record], Record]
+#: A stage of a drawing; again in each turn, by its number from 0, until it is done or refused.
+Stage = Callable[[int], Record]
 
 
 def drawing_kind(tools: DrawingTools) -> JobKind:
     """The kind of job behind C-STORE and STOW-RS."""
 
-    def follow(run: JobRun, argument: Record) -> Record:
-        for part in ("fetch", "reconstruct", *map(_delivery, argument["send_to"])):
-            answer = _until_done(tools, run, part, argument)
+    def follow(run: JobRun, drawing: Record) -> Record:
+        for stage in _stages(tools, run, drawing):
+            answer = _until_done(tools, run, stage)
             if answer["state"] != DONE:
-                run.spread("quarantine", [{**argument, "reason": answer["reason"]}])
+                run.step("quarantine", partial(_quarantine, tools, drawing, answer["reason"]))
                 return {"quarantined": answer["reason"]}
-        run.spread("forget", [argument])
+        run.step("forget", partial(_forget, tools, drawing))
         return {"stored": answer["uids"]}
 
-    parts: dict[str, Part] = {
-        "fetch": partial(_guarded, tools, work=_fetch),
-        "reconstruct": partial(_guarded, tools, work=_reconstruct),
-        **{
-            _delivery(archive.name): partial(_guarded, tools, work=partial(_deliver, archive.name))
-            for archive in tools.desk.configuration.archives
-        },
-        "quarantine": lambda item, _: _quarantine(tools, item),
-        "forget": lambda item, _: _forget(tools, item),
-    }
-    return JobKind(DRAWING_JOB, follow, parts)
+    def reconstruct(item: Record, check: Check) -> Record:
+        return _guarded(tools, item, partial(_reconstruct, check=check))
+
+    return JobKind(DRAWING_JOB, follow, {"reconstruct": reconstruct})
 
 
-def _until_done(tools: DrawingTools, run: JobRun, part: str, item: Record) -> Record:
-    """The part's answer, after as many turns as it takes; a turn is remembered, and so is the wait before it."""
-    configuration = tools.desk.configuration
-    turn, waited, wait_s = 0, 0.0, configuration.retry_first_s
-    while True:
+def _stages(tools: DrawingTools, run: JobRun, drawing: Record) -> Iterator[Stage]:
+    """Exchanges with archives are steps, of which many wait at the same time; the computing is a part of the queue."""
+    delivered: dict[str, Record] = {}
+
+    def exchange(name: str, work: Work) -> Record:
+        return run.step(name, partial(_in_turn, tools, drawing, work))
+
+    def reconstruct(turn: int) -> Record:
         # An item is remembered by its number, so the turns before this one are asked for again and answered at once.
-        answer = run.spread(part, [{**item, "turn": number} for number in range(turn + 1)])[-1]
-        lasts = waited < configuration.images_awaited_s
-        if answer["state"] == MISSING and not lasts:
+        return run.spread("reconstruct", [{**drawing, "turn": number} for number in range(turn + 1)])[-1]
+
+    def deliver(_: int) -> Record:
+        # An archive that is away keeps results from no other.
+        for archive in drawing["send_to"]:
+            if delivered.get(archive, {"state": AGAIN})["state"] == AGAIN:
+                delivered[archive] = exchange(f"deliver to {archive}", partial(_deliver, archive=archive))
+        return min(delivered.values(), key=lambda answer: (AGAIN, REFUSED, DONE).index(answer["state"]))
+
+    yield lambda _: exchange("fetch", _fetch)
+    yield reconstruct
+    yield deliver
+
+
+def _until_done(tools: DrawingTools, run: JobRun, stage: Stage) -> Record:
+    """The stage's answer, after as many turns as it takes."""
+    configuration = tools.desk.configuration
+    waited, wait_s = 0.0, configuration.retry_first_s
+    for turn in count():
+        try:
+            answer = stage(turn)
+        except GivenUp as error:
+            return {"state": REFUSED, "reason": str(error)}
+        if answer["state"] == MISSING and waited >= configuration.images_awaited_s:
             return {**answer, "state": REFUSED}
         if answer["state"] in (DONE, REFUSED):
-            return answer
-        run.step("wait", partial(_sleep, wait_s))
-        turn, waited, wait_s = turn + 1, waited + wait_s, min(2 * wait_s, configuration.retry_longest_s)
+            break
+        run.wait(wait_s)
+        waited, wait_s = waited + wait_s, min(2 * wait_s, configuration.retry_longest_s)
+    return answer
 
 
-def _sleep(seconds: float) -> Record:
-    time.sleep(seconds)
-    return {}
+def _in_turn(tools: DrawingTools, drawing: Record, work: Work) -> Record:
+    with tools.lines:
+        return _guarded(tools, drawing, work)
 
 
-def _guarded(tools: DrawingTools, item: Record, check: Check, work: Work) -> Record:
+def _guarded(tools: DrawingTools, item: Record, work: Work) -> Record:
     try:
-        return work(tools, item, check)
+        return work(tools, item)
     except FileNotFoundError:
         return {"state": REFUSED, "reason": "The files of the drawing are gone."}
     except (ArchiveUnavailable, OSError) as error:
@@ -110,8 +139,7 @@ def _guarded(tools: DrawingTools, item: Record, check: Check, work: Work) -> Rec
         return {"state": REFUSED, "reason": "The drawing met a fault of the program."}
 
 
-def _fetch(tools: DrawingTools, item: Record, check: Check) -> Record:
-    check()
+def _fetch(tools: DrawingTools, item: Record) -> Record:
     if tools.desk.fetch(item["object"], item["rule"]):
         return {"state": DONE}
     return {"state": MISSING, "reason": "The images that the drawing refers to are not in the archive."}
@@ -132,21 +160,15 @@ def _reconstruct(tools: DrawingTools, item: Record, check: Check) -> Record:
     return {"state": DONE, "cut": derivation.is_cut}
 
 
-def _delivery(archive: str) -> str:
-    """Name of the part that gives results to an archive."""
-    return f"deliver to {archive}"
-
-
-def _deliver(archive: str, tools: DrawingTools, item: Record, check: Check) -> Record:
-    check()
+def _deliver(tools: DrawingTools, item: Record, archive: str) -> Record:
     uids = tools.desk.deliver(item["object"], archive)
     tools.log.info("results stored", job=item["object"], objects=len(uids))
     return {"state": DONE, "uids": uids}
 
 
-def _quarantine(tools: DrawingTools, item: Record) -> Record:
-    tools.desk.set_aside(item["object"], item["reason"])
-    tools.log.warning("object quarantined", job=item["object"], reason=item["reason"])
+def _quarantine(tools: DrawingTools, item: Record, reason: str) -> Record:
+    tools.desk.set_aside(item["object"], reason)
+    tools.log.warning("object quarantined", job=item["object"], reason=reason)
     return {}
 
 

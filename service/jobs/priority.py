@@ -10,8 +10,12 @@ AUTOGROUP = Path("/proc/self/autogroup")
 
 
 def stand_back(nice: int, autogroup: Path = AUTOGROUP) -> int:
-    """Give way to other processes (0 to 19) on any system, and to other sessions on Linux; returns the nice value."""
+    """Give way to other processes (0 to 19) on any system, and to other sessions on Linux; returns the nice value.
+
+    A session that others lead is left as it is: the service whose requests come first may be in it.
+    """
     reached = os.nice(nice)
-    with suppress(OSError):
-        autogroup.write_text(str(reached), encoding="ascii")
+    if os.getsid(0) == os.getpid():
+        with suppress(OSError):
+            autogroup.write_text(str(reached), encoding="ascii")
     return reached

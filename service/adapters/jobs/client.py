@@ -21,6 +21,7 @@ from service.adapters.jobs.database import (
     Leases,
     json_serializer,
     prepare,
+    queue_of,
 )
 from service.errors import Overloaded, UnknownJob
 from service.job_ports import JobState, JobStatus, Record
@@ -77,7 +78,7 @@ class DbosJobs:
         self._client.enqueue(
             {
                 "workflow_name": JOB,
-                "queue_name": JOBS_QUEUE,
+                "queue_name": queue_of(kind),
                 "workflow_id": identifier,
                 "app_version": RECORDS_VERSION,
             },
@@ -128,7 +129,7 @@ class DbosJobs:
 
     @_answered
     def unfinished(self) -> int:
-        """Jobs that wait or run."""
+        """Jobs that wait or run, less those that wait for archives."""
         return self._open()[1].count(JOBS_QUEUE, "ENQUEUED", "PENDING")
 
     @_answered

@@ -13,12 +13,15 @@ import sqlalchemy as sa
 from dbos import DBOS, DBOSPortableJSONSerializer
 from sqlalchemy.engine import make_url
 
+from service.pacs_ports import DRAWING_JOB
+
 #: Of the application in DBOS's records.
 APPLICATION = "morphoflow"
 #: Of the records, not of the program: releases with the same one take over each other's jobs.
 RECORDS_VERSION = "jobs-1"
-#: Jobs wait in the first, the parts that they are made of in the second.
-JOBS_QUEUE, PARTS_QUEUE = "jobs", "parts"
+#: Jobs wait in the first; those that spend their time waiting for archives in the second, so that an archive that is
+#: away holds up no other job; the parts that jobs are made of in the third.
+JOBS_QUEUE, PATIENT_QUEUE, PARTS_QUEUE = "jobs", "patient", "parts"
 #: Names of the two workflows.
 JOB, PART = "job", "part"
 #: Schema of DBOS's tables on PostgreSQL.
@@ -34,6 +37,11 @@ _NOW_MS = {
     "sqlite": "CAST((julianday('now') - 2440587.5) * 86400000 AS INTEGER)",
     "postgresql": "CAST(extract(epoch FROM clock_timestamp()) * 1000 AS BIGINT)",
 }
+
+
+def queue_of(kind: str) -> str:
+    """Where jobs of a kind wait."""
+    return PATIENT_QUEUE if kind == DRAWING_JOB else JOBS_QUEUE
 
 
 def json_serializer() -> DBOSPortableJSONSerializer:

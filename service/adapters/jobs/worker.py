@@ -13,9 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from dbos import DBOS, DBOSConfig, PortableWorkflowError, SetEnqueueOptions, SetWorkflowID, StepOptions
+from dbos import error as dbos_error
 from sqlalchemy.exc import DBAPIError
 
 from model.errors import MorphoFlowError
+from service.adapters.jobs.busy import Busy
 from service.adapters.jobs.client import PROGRESS, DbosJobs
 from service.adapters.jobs.database import (
     APPLICATION,
@@ -23,24 +25,27 @@ from service.adapters.jobs.database import (
     JOBS_QUEUE,
     PART,
     PARTS_QUEUE,
+    PATIENT_QUEUE,
     RECORDS_VERSION,
     SCHEMA,
     Leases,
     json_serializer,
     prepare,
+    queue_of,
 )
-from service.errors import KINDS, Cancelled, Overloaded, StoreFull
+from service.errors import KINDS, Cancelled, GivenUp, Overloaded, StoreFull
 from service.job_ports import Check, JobKind, Record
 from service.observability import Log, make_log
 
-#: Jobs that one worker follows at the same time; following one is waiting for its parts.
-JOBS_FOLLOWED = 16
+#: Jobs that one worker follows at the same time; following one is waiting for its parts, or for an archive.
+JOBS_FOLLOWED, PATIENT_FOLLOWED = 16, 128
 #: Parts of one job that are queued or done at any time, so that no job fills the database.
 WINDOW = 64
 #: Connections of one worker to PostgreSQL, at most.
 CONNECTIONS = 6
-#: How often (s) queues are read, answers of parts are asked for, and a running part asks whether its job is wanted.
-POLL_S, ANSWER_POLL_S, CHECK_S = 0.1, 0.2, 0.3
+#: How often (s) queues of jobs and of parts are read, answers of parts are asked for, and a running part asks whether
+#: its job is wanted. Reading an empty queue takes some ms of a core.
+JOBS_POLL_S, PARTS_POLL_S, ANSWER_POLL_S, CHECK_S = 0.2, 0.1, 0.2, 0.3
 #: After so many workers have died over one part it is given up.
 MAX_DEATHS = 20
 #: A part whose disk or storage fails is tried again after 1, 2, 4, ... s.
@@ -83,14 +88,16 @@ def running_worker(kinds: Sequence[JobKind], options: WorkerOptions, log: Log | 
         "run_migrations": False,
         "sys_db_pool_size": CONNECTIONS,
     }
-    dbos, busy = DBOS(config=config), _Busy()
+    dbos, busy = DBOS(config=config), Busy()
     _register({kind.name: kind for kind in kinds}, jobs, busy, log or make_log("error"))
-    DBOS.listen_queues([JOBS_QUEUE, PARTS_QUEUE])
+    queues = {queue_of(kind.name) for kind in kinds}
+    DBOS.listen_queues([*queues, PARTS_QUEUE])
     leases, stop = Leases(options.url), threading.Event()
     leases.renew(options.executor)
     DBOS.launch()
-    DBOS.register_queue(JOBS_QUEUE, worker_concurrency=JOBS_FOLLOWED, polling_interval_sec=POLL_S)
-    DBOS.register_queue(PARTS_QUEUE, worker_concurrency=1, polling_interval_sec=POLL_S)
+    DBOS.register_queue(JOBS_QUEUE, worker_concurrency=JOBS_FOLLOWED, polling_interval_sec=JOBS_POLL_S)
+    DBOS.register_queue(PATIENT_QUEUE, worker_concurrency=PATIENT_FOLLOWED, polling_interval_sec=JOBS_POLL_S)
+    DBOS.register_queue(PARTS_QUEUE, worker_concurrency=1, polling_interval_sec=PARTS_POLL_S)
     keeper = threading.Thread(target=_keep_lease, args=(leases, options, stop), name="lease", daemon=True)
     keeper.start()
     try:
@@ -98,7 +105,7 @@ def running_worker(kinds: Sequence[JobKind], options: WorkerOptions, log: Log | 
     finally:
         for event in dbos.background_thread_stop_events:  # no more parts are taken
             event.set()
-        busy.wait(options.drain_s)
+        busy.end(options.drain_s)
         DBOS._recover_pending_workflows([options.executor])
         DBOS.destroy(destroy_registry=True)
         stop.set()
@@ -108,49 +115,19 @@ def running_worker(kinds: Sequence[JobKind], options: WorkerOptions, log: Log | 
         jobs.close()
 
 
-class _Busy:
-    """Counts the parts that run."""
-
-    def __init__(self) -> None:
-        self._count = 0
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def one(self) -> Iterator[None]:
-        with self._changed:
-            self._count += 1
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._count -= 1
-                self._changed.notify_all()
-
-    def wait(self, limit_s: float) -> None:
-        """Until none runs, but no longer than so."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._count == 0, limit_s)
-
-
-def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: _Busy, log: Log) -> None:
+def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: Busy, log: Log) -> None:
     @DBOS.workflow(name=PART, max_recovery_attempts=MAX_DEATHS)
     def part(job: str, kind: str, name: str, item: dict[str, Any]) -> dict[str, Any]:
         check = _rarely(lambda: _require_wanted(jobs, job))
         check()
-        options: StepOptions = {
-            "name": name,
-            "retries_allowed": True,
-            "max_attempts": ATTEMPTS,
-            "should_retry": lambda error: isinstance(error, OSError | StoreFull),
-        }
-        with busy.one(), _told(log, job):
-            return dict(DBOS.run_step(options, kinds[kind].parts[name], item, check))
+        with busy.one(), _told(log, job, name):
+            return dict(DBOS.run_step(_tried_again(name), kinds[kind].parts[name], item, check))
 
     @DBOS.workflow(name=JOB, max_recovery_attempts=None)
     def job(kind: str, argument: dict[str, Any]) -> dict[str, Any]:
         identifier = DBOS.workflow_id
         assert identifier is not None
-        run = _Run(identifier, kind, part)
+        run = _Run(identifier, kind, part, jobs, busy)
         try:
             return {"result": dict(kinds[kind].follow(run, argument))}
         except MorphoFlowError as error:
@@ -161,9 +138,21 @@ def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: _Busy, log: Lo
             return {"problem": error.message}
 
 
+def _tried_again(name: str) -> StepOptions:
+    """A step that is tried again when its disk or storage fails."""
+    return {
+        "name": name,
+        "retries_allowed": True,
+        "max_attempts": ATTEMPTS,
+        "should_retry": lambda error: isinstance(error, OSError | StoreFull),
+    }
+
+
 @contextmanager
-def _told(log: Log, job: str) -> Iterator[None]:
-    """Log what is no error of this project's own."""
+def _told(log: Log, job: str, part: str) -> Iterator[None]:
+    """Log a part's time, and what is no error of this project's own."""
+    began = time.perf_counter()
+    log.debug("part begun", job=job, part=part)
     try:
         yield
     except MorphoFlowError:
@@ -171,15 +160,21 @@ def _told(log: Log, job: str) -> Iterator[None]:
     except Exception as fault:
         log.error("fault in a job", job=job, exc_info=fault)
         raise
+    finally:
+        log.debug("part ended", job=job, part=part, seconds=round(time.perf_counter() - began, 3))
 
 
 class _Run:
     """The `JobRun` of a workflow."""
 
-    def __init__(self, identifier: str, kind: str, part: Callable[..., dict[str, Any]]) -> None:
+    def __init__(
+        self, identifier: str, kind: str, part: Callable[..., dict[str, Any]], jobs: DbosJobs, busy: Busy
+    ) -> None:
         self._id = identifier
         self._kind = kind
         self._part = part
+        self._jobs = jobs
+        self._busy = busy
         self._started_ms = self.step("start", lambda: {"ms": int(time.time() * 1000)})["ms"]
         self._done = self._total = 0
 
@@ -190,33 +185,64 @@ class _Run:
 
     def step(self, name: str, work: Callable[[], Record]) -> Record:
         """Short work that is done once."""
-        return DBOS.run_step({"name": name}, lambda: dict(work()))
+        with self._busy.one():
+            return DBOS.run_step(_tried_again(name), lambda: dict(work()))
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass; after a restart, what is left of it."""
+        end = self.step("wait", lambda: {"end": time.time() + seconds})["end"]
+        self._busy.pause(max(0.0, end - time.time()))
 
     def expect(self, total: int) -> None:
         """How many items the job has."""
         self._total = total
-        self._report()
+        with self._busy.one():
+            self._report()
 
     def spread(self, part: str, items: Sequence[Record], sizes: Sequence[int] | None = None) -> list[Record]:
         """A part for each item, a window of them at a time; the nearest item first among all jobs."""
         counts = [1] * len(items) if sizes is None else sizes
-        waiting = deque(self._begin(part, number, items[number]) for number in range(min(WINDOW, len(items))))
+        with self._busy.one():
+            waiting = deque(self._begin(part, number, items[number]) for number in range(min(WINDOW, len(items))))
         answers: list[Record] = []
         while waiting:
-            answers.append(waiting.popleft().get_result(polling_interval_sec=ANSWER_POLL_S))
-            self._done += counts[len(answers) - 1]
-            self._report()
-            following = len(answers) + len(waiting)
-            if following < len(items):
-                waiting.append(self._begin(part, following, items[following]))
+            first = waiting.popleft()
+            self._await_end(first.workflow_id)
+            with self._busy.one():
+                answers.append(_answer(first))
+                self._done += counts[len(answers) - 1]
+                self._report()
+                following = len(answers) + len(waiting)
+                if following < len(items):
+                    waiting.append(self._begin(part, following, items[following]))
         return answers
 
     def _begin(self, name: str, number: int, item: Record) -> Any:
         with SetWorkflowID(f"{self._id}/{name}/{number}"), SetEnqueueOptions(priority=number + 1):
             return DBOS.enqueue_workflow(PARTS_QUEUE, self._part, self._id, self._kind, name, dict(item))
 
+    def _await_end(self, part: str) -> None:
+        """Until a part has ended, wherever it is done."""
+        while self._is_wanted(part):
+            self._busy.pause(ANSWER_POLL_S)
+
+    def _is_wanted(self, part: str) -> bool:
+        try:
+            return self._jobs.is_wanted(part)
+        except Overloaded:  # the database is away; the next look may find it
+            return True
+
     def _report(self) -> None:
         DBOS.set_event(PROGRESS, {"done": self._done, "total": self._total, "started_ms": self._started_ms})
+
+
+def _answer(part: Any) -> dict[str, Any]:
+    """What a part that has ended answers."""
+    try:
+        answer: dict[str, Any] = part.get_result(polling_interval_sec=ANSWER_POLL_S)
+    except dbos_error.DBOSAwaitedWorkflowMaxRecoveryAttemptsExceeded:
+        raise GivenUp("A part of the job ended its worker again and again; it was given up.") from None
+    return answer
 
 
 def _require_wanted(jobs: DbosJobs, job: str) -> None:

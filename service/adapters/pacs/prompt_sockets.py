@@ -6,6 +6,7 @@ seconds. Either side can end this alone: here segments are sent at once, and ack
 """
 
 import socket
+from contextlib import suppress
 from typing import Any
 
 from pynetdicom import evt
@@ -20,6 +21,11 @@ class _PromptSocket(socket.socket):
         if _QUICK_ACK is not None:
             self.setsockopt(socket.IPPROTO_TCP, _QUICK_ACK, 1)
         return super().recv(size, flags)
+
+    def shutdown(self, how: int, /) -> None:
+        """As its parent, but a peer that has left is no error: who shuts down closes next, and must come to that."""
+        with suppress(OSError):
+            super().shutdown(how)
 
 
 def _opened(event: Any) -> None:
