@@ -8,18 +8,20 @@ LOAD_TIMES (file that the times of answers (s) are written to at the end).
 import itertools
 import json
 import os
+import time
 from pathlib import Path
 
-import gevent
 from locust import FastHttpUser, constant_throughput, events, task
 from urllib3 import encode_multipart_formdata
 
 RATE, USERS = float(os.environ.get("LOAD_RATE", "0")), int(os.environ.get("LOAD_USERS", "1"))
 KIND = os.environ.get("LOAD_KIND", "none")
 TIMES: list[float] = []
+#: Body and headers.
+Prepared = tuple[bytes, dict[str, str]]
 
 
-def prepared(accept: str, **form: str) -> tuple[bytes, dict[str, str]]:
+def prepared(accept: str, **form: str) -> Prepared:
     """Body and headers of a request to reconstruct."""
     mask = ("mask.nii.gz", Path(os.environ["LOAD_MASK"]).read_bytes(), "application/gzip")
     body, kind = encode_multipart_formdata({"mask": mask, **form})
@@ -31,18 +33,25 @@ LAPLACE = prepared("model/stl", uncertainty="laplace")
 COARSE = prepared("application/json", uncertainty="none", resolution_mm="4")
 SURE = prepared("application/x-ply", uncertainty="laplace", resolution_mm="4")
 #: Requests in turn: most are the smallest that the service answers, all kinds are among them.
-TURNS = {"none": [PLAIN], "laplace": [LAPLACE], "mixed": [*[COARSE] * 8, SURE, None]}[KIND]
+KINDS: dict[str, list[Prepared | None]] = {
+    "none": [PLAIN],
+    "laplace": [LAPLACE],
+    "mixed": [*[COARSE] * 8, SURE, None],
+}
+TURNS = KINDS[KIND]
 
 
-@events.request.add_listener
 def _keep(response_time: float, exception: BaseException | None, **_: object) -> None:
     if exception is None:
         TIMES.append(response_time / 1000.0)
 
 
-@events.quitting.add_listener
 def _write(**_: object) -> None:
     Path(os.environ["LOAD_TIMES"]).write_text(json.dumps(TIMES))
+
+
+events.request.add_listener(_keep)
+events.quitting.add_listener(_write)
 
 
 class Caller(FastHttpUser):
@@ -57,7 +66,7 @@ class Caller(FastHttpUser):
         """Wait for the own place among the beats."""
         self.turn = next(self.numbers)
         if RATE:
-            gevent.sleep(self.turn / (RATE * USERS))
+            time.sleep(self.turn / (RATE * USERS))
 
     @task
     def ask(self) -> None:

@@ -105,7 +105,7 @@ def running_orthanc(
     settings = folder / "orthanc.json"
     settings.write_text(json.dumps(_settings(folder, ports, service_dicom_port, service_http_port, script)))
     with (folder / "orthanc.log").open("ab") as log:
-        command = [shutil.which("Orthanc") or "Orthanc", settings]
+        command = [shutil.which("Orthanc") or "Orthanc", str(settings)]
         process = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, **PROMPT})
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{ports[0]}", timeout=60.0) as client:
