@@ -24,6 +24,7 @@ from service.ports import MaskReader
 from service.routes.comparisons import comparisons_router
 from service.routes.dependencies import Services
 from service.routes.jobs import jobs_router
+from service.routes.latent import latent_router
 from service.routes.middleware import AccessMiddleware, BodyLimitMiddleware, KeyMiddleware
 from service.routes.models import models_router
 from service.routes.modes import modes_router
@@ -140,6 +141,7 @@ def _add_routes(app: FastAPI) -> None:
         comparisons_router,
         planes_router,
         posterior_router,
+        latent_router,
         models_router,
         modes_router,
         samples_router,

@@ -2,6 +2,7 @@
 
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +22,7 @@ from service.adapters.images import write_nifti
 from service.adapters.mesh_formats import write_mesh
 from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, manifest_bytes
 from service.app import mask_reader
-from service.console import echo_json, progress, require_free, require_suffix
+from service.console import echo_json, in_order, progress, require_free, require_suffix
 from service.model_registry import ModelRegistry
 from service.ports import MeshFormat, Outcome, SampleFormat
 from service.presentation import model_summary, summary_of
@@ -44,6 +45,7 @@ FidelityOption = Annotated[
 ExtentsOption = Annotated[
     str, typer.Option(help="R, A, S, longest, or directions such as 0.5 0 0.87, separated by commas.")
 ]
+RejectOption = Annotated[bool, typer.Option("--reject/--no-reject", help="Draw anew where a shape is implausible.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
 
 
@@ -100,6 +102,7 @@ def sample(
     format: Annotated[SampleFormat, typer.Option(help="File format.")] = SampleFormat.STL,
     temperature: Annotated[float, typer.Option(help="Spread of the shapes; 1 is the population's.")] = 1.0,
     spacing_mm: Annotated[float | None, typer.Option(help="Grid step (mm); the model's when left out.")] = None,
+    reject: RejectOption = True,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -107,12 +110,12 @@ def sample(
     settings = load_settings()
     chosen = context.obj(settings).get(model)
     seeds = use_cases.batch_seeds(seed, count, use_cases.MAX_SEED)
-    how = Draw(format, temperature, spacing_mm, settings.max_voxels)
+    how = Draw(format, temperature, spacing_mm, settings.max_voxels, reject)
     if output.suffix.lower() == ".zip":
         require_free({"--output": output}, force=force)
-        manifest = _sample_to_zip(chosen, seeds, how, output)
+        manifest = _sample_to_zip(chosen, seeds, how, output, settings.workers)
     else:
-        manifest = _sample_to_folder(chosen, seeds, how, output, force=force)
+        manifest = _sample_to_folder(chosen, seeds, how, output, settings.workers, force=force)
     typer.echo(manifest.decode() if as_json else f"{count} shapes of {chosen.manifest.name} written.")
 
 
@@ -162,30 +165,29 @@ def _write_volume(
     path.write_bytes(write_nifti(volume.array, volume.grid, compute.__name__.replace("_", " ")))
 
 
-def _sample_to_zip(model: ShapeModel, seeds: range, how: Draw, target: Path) -> bytes:
+def _sample_to_zip(model: ShapeModel, seeds: range, how: Draw, target: Path, workers: int) -> bytes:
     with zipfile.ZipFile(target, "w") as archive:
-        manifest = _make_all(model, seeds, how, lambda file: archive.writestr(file.name, file.data))
+        manifest = _make_all(model, seeds, how, lambda file: archive.writestr(file.name, file.data), workers)
         archive.writestr(MANIFEST, manifest)
     return manifest
 
 
-def _sample_to_folder(model: ShapeModel, seeds: range, how: Draw, target: Path, *, force: bool) -> bytes:
+def _sample_to_folder(model: ShapeModel, seeds: range, how: Draw, target: Path, workers: int, *, force: bool) -> bytes:
     if target.exists() and not target.is_dir():
         raise InvalidParameter("--output must be a folder or end with .zip.", part="--output")
     if not force and target.is_dir() and any(target.iterdir()):
         raise InvalidParameter("--output names a folder that is not empty; --force writes into it.", part="--output")
     target.mkdir(parents=True, exist_ok=True)
-    manifest = _make_all(model, seeds, how, lambda file: (target / file.name).write_bytes(file.data))
+    manifest = _make_all(model, seeds, how, lambda file: (target / file.name).write_bytes(file.data), workers)
     (target / MANIFEST).write_bytes(manifest)
     return manifest
 
 
-def _make_all(model: ShapeModel, seeds: range, how: Draw, put: Callable[[SampleFile], Any]) -> bytes:
+def _make_all(model: ShapeModel, seeds: range, how: Draw, put: Callable[[SampleFile], Any], workers: int) -> bytes:
     writer, entries = SampleWriter(write_mesh, write_nifti), []
     with progress(len(seeds)) as step:
-        for seed in seeds:
-            step(f"seed {seed}")
-            file = writer.make(model, seed, how)
+        for file in in_order(partial(writer.make, model, how=how), seeds, workers):
+            step(file.name)
             put(file)
             entries.append(file.entry)
     return manifest_bytes(model, how, entries)

@@ -1,9 +1,13 @@
 """What commands share: progress on a terminal, files that are not overwritten, output for machines."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
+from typing import TypeVar
 
 import typer
 from pydantic import BaseModel
@@ -12,6 +16,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from model.errors import InvalidParameter
 from model.inference.reconstruction import Watch
+
+T = TypeVar("T")
 
 
 @contextmanager
@@ -36,6 +42,22 @@ def bar() -> Iterator[Callable[[str, int, int], None]]:
     with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as shown:
         task = shown.add_task("", total=None)
         yield lambda name, done, total: shown.update(task, description=name, completed=done, total=total or None)
+
+
+def in_order(work: Callable[[int], T], numbers: Iterable[int], workers: int) -> Iterator[T]:
+    """Results of the work on numbers in their order, by several threads; few are begun before they are taken."""
+    begun: deque[Future[T]] = deque()
+    remaining = iter(numbers)
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            while True:
+                begun.extend(pool.submit(work, number) for number in islice(remaining, workers + 1 - len(begun)))
+                if not begun:
+                    return
+                yield begun.popleft().result()
+        finally:
+            for future in begun:
+                future.cancel()
 
 
 def require_free(paths: dict[str, Path | None], *, force: bool) -> None:

@@ -14,7 +14,7 @@ from model.inference.calipers import USUAL_TEXT, parse_extents
 from model.inference.fitting import MirrorRule
 from model.inference.reconstruction import UncertaintyRule
 from service import use_cases
-from service.commands import ExtentsOption, FidelityOption, ForceOption, JsonOption, ModelOption
+from service.commands import ExtentsOption, FidelityOption, ForceOption, JsonOption, ModelOption, RejectOption
 from service.console import bar, echo_json, require_free
 from service.errors import NotReady
 from service.job_files import JobFiles
@@ -58,6 +58,7 @@ def sample_job(
     format: Annotated[SampleFormat, typer.Option(help="File format.")] = SampleFormat.STL,
     temperature: Annotated[float, typer.Option(help="Spread of the shapes; 1 is the population's.")] = 1.0,
     spacing_mm: Annotated[float | None, typer.Option(help="Grid step (mm); the model's when left out.")] = None,
+    reject: RejectOption = True,
     key: KeyOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -75,6 +76,7 @@ def sample_job(
         "format": format.value,
         "temperature": temperature,
         "spacing_mm": spacing_mm,
+        "reject": reject,
     }
     _begin(settings, SAMPLES_JOB, argument, None, key, output, as_json=as_json)
 

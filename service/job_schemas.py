@@ -12,7 +12,7 @@ from service.job_ports import JobState
 from service.ports import RECONSTRUCTIONS_JOB, SAMPLES_JOB, MeshFormat, SampleFormat
 from service.schemas import Seed, SpacingMm, parse_annotated, parse_labels
 
-_OF_SAMPLES = ("count", "temperature", "spacing_mm")
+_OF_SAMPLES = ("count", "temperature", "spacing_mm", "reject")
 _OF_RECONSTRUCTIONS = ("archive", "label", "annotated", "uncertainty", "mirror", "resolution_mm", "fidelity", "extents")
 
 
@@ -34,6 +34,7 @@ class JobForm(BaseModel):
         1.0, gt=0.0, le=2.0, allow_inf_nan=False, description="of samples: spread of the shapes; 1 is the population's"
     )
     spacing_mm: SpacingMm | None = Field(None, description="of samples: grid step (mm); the model's when left out")
+    reject: bool = Field(True, description="of samples: draw anew where a shape is implausible")
     archive: UploadFile | None = Field(None, description="of reconstructions: a ZIP of masks, each of one object")
     label: list[str] = Field(default_factory=list, description="of reconstructions: as of a single one")
     annotated: str = Field("auto", description="of reconstructions: as of a single one")

@@ -38,7 +38,7 @@ class MeshFormat(StrEnum):
 
 
 class SampleFormat(StrEnum):
-    """Formats of synthetic shapes: meshes, a label map, or arrays."""
+    """Formats of synthetic shapes: meshes, a label map, arrays, or a label map with a sparse drawing of it."""
 
     STL = "stl"
     PLY = "ply"
@@ -49,6 +49,7 @@ class SampleFormat(StrEnum):
     MZ3 = "mz3"
     NIFTI = "nifti"
     NPZ = "npz"
+    PAIRS = "pairs"
 
 
 @dataclass(frozen=True)

@@ -131,6 +131,9 @@ class SampleQuery(_Closed):
         1.0, gt=0.0, le=2.0, allow_inf_nan=False, description="spread of the shapes; 1 is the population's"
     )
     spacing_mm: SpacingMm | None = Field(None, description="grid step (mm); the model's when left out")
+    reject: bool = Field(
+        True, description="draw anew where a shape is implausible: not one component, or of a volume out of range"
+    )
 
 
 class BatchQuery(SampleQuery):

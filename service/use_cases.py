@@ -11,6 +11,7 @@ from model.errors import InvalidParameter, TooLarge, UnknownModel
 from model.geometry import Grid, Pose
 from model.inference.comparison import compared
 from model.inference.fitting import Fit, FitStatus
+from model.inference.latent import LatentFeatures, latent_features, shape_between
 from model.inference.mesh import Mesh
 from model.inference.modes import ShapeModes, shape_along
 from model.inference.next_plane import Among, NextPlane
@@ -24,7 +25,7 @@ from model.inference.surface import covering_grid
 from model.inference.uncertainty import ShapeState, occupancy, voxel_entropy
 from model.interruption import Check, interruptible
 from service.errors import NotComputed
-from service.ports import Catalogue, Outcome, ResultStore, StoredResult
+from service.ports import Catalogue, ModeSource, Outcome, ResultStore, StoredResult
 
 #: A voxel belongs to the object from this probability on.
 OCCUPIED = 0.5
@@ -155,15 +156,23 @@ def posterior(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, 
     return Posterior(model, outcome, step)
 
 
-def draw(model: ShapeModel, seed: int, temperature: float, spacing_mm: float | None, max_voxels: int) -> SampledShape:
-    """One synthetic shape.
+def draw(
+    model: ShapeModel,
+    seed: int,
+    temperature: float,
+    spacing_mm: float | None,
+    max_voxels: int,
+    *,
+    reject: bool = True,
+) -> SampledShape:
+    """One synthetic shape, drawn anew where it is implausible unless `reject` is off.
 
     Raises:
         InvalidParameter: temperature or spacing out of its range.
         TooLarge: the evaluated grid would have more voxels than allowed.
     """
     require_step(model, spacing_mm, max_voxels)
-    return draw_shape(model, seed, temperature=temperature, spacing_mm=spacing_mm)
+    return draw_shape(model, seed, temperature=temperature, spacing_mm=spacing_mm, reject=reject)
 
 
 def require_step(model: ShapeModel, spacing_mm: float | None, max_voxels: int) -> None:
@@ -173,8 +182,8 @@ def require_step(model: ShapeModel, spacing_mm: float | None, max_voxels: int) -
         raise _too_many_voxels(max_voxels)
 
 
-def batch_seeds(seed: int, count: int, max_count: int) -> range:
-    """Seeds of a batch: item i has seed + i.
+def batch_seeds(seed: int, count: int, max_count: int, beyond: str = "") -> range:
+    """Seeds of a batch: item i has seed + i; `beyond` says to a caller who wants too many what takes more.
 
     Raises:
         TooLarge: more shapes than allowed.
@@ -183,7 +192,7 @@ def batch_seeds(seed: int, count: int, max_count: int) -> range:
     if count < 1:
         raise InvalidParameter("The parameter count must be 1 or more.", part="count")
     if count > max_count:
-        raise TooLarge(f"The parameter count must not be larger than {max_count}.", part="count")
+        raise TooLarge(f"The parameter count must not be larger than {max_count}{beyond}.", part="count")
     if not 0 <= seed <= MAX_SEED - count + 1:
         raise InvalidParameter(f"The seeds of a batch must lie between 0 and {MAX_SEED}.", part="seed")
     return range(seed, seed + count)
@@ -211,6 +220,51 @@ def shape_along_modes(
     """
     require_step(model, spacing_mm, max_voxels)
     return shape_along(model, modes, coordinates, spacing_mm)
+
+
+def features(catalogue: Catalogue, outcome: Outcome, modes: ModeSource) -> LatentFeatures:
+    """The latent code of an outcome beside the training population's.
+
+    Raises:
+        NotComputed: the model that made the outcome is no longer loaded.
+    """
+    model, state = _same_model(catalogue, outcome), outcome.reconstruction.state
+    return latent_features(model, modes(model), state.fits[0], state.covariance)
+
+
+@dataclass(frozen=True)
+class Way:
+    """The way from one outcome's code to another's, in the world of the first.
+
+    Attributes:
+        spacing_mm: grid step of the surfaces; the model's when None.
+    """
+
+    model: ShapeModel
+    start: Fit
+    end: Fit
+    spacing_mm: float | None
+
+    def shape(self, at: float) -> Mesh:
+        """Surface at a place, 0 the start and 1 the end."""
+        return shape_between(self.model, self.start.latent, self.end.latent, self.start.pose, at, self.spacing_mm)
+
+
+def way_between(
+    catalogue: Catalogue, outcome: Outcome, other: Outcome, spacing_mm: float | None, max_voxels: int
+) -> Way:
+    """The way between two outcomes of one model.
+
+    Raises:
+        NotComputed: the model that made the outcomes is no longer loaded.
+        InvalidParameter: two models made them.
+        TooLarge: a surface's grid would have more voxels than allowed.
+    """
+    if outcome.model_digest != other.model_digest:
+        raise InvalidParameter("Two models made the results; results of one model are accepted.", part="with")
+    model = _same_model(catalogue, outcome)
+    require_step(model, spacing_mm, max_voxels)
+    return Way(model, outcome.reconstruction.state.fits[0], other.reconstruction.state.fits[0], spacing_mm)
 
 
 def describe(catalogue: Catalogue) -> Iterator[ShapeModel]:

@@ -1,5 +1,6 @@
 """Synthetic shapes from the prior."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,11 +9,14 @@ from jaxtyping import Float
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
 from model.geometry import Pose
-from model.inference.mesh import Mesh
+from model.inference.mesh import Mesh, largest_component
+from model.inference.plausibility import counted, implausible
 from model.inference.surface import require_spacing, surface_of
 
 #: Accepted temperatures: above 0, at most this.
 HIGHEST_TEMPERATURE = 2.0
+#: A seed is drawn from at most so often; the last draw stands, plausible or not.
+MAX_DRAWS = 16
 
 
 @dataclass(frozen=True)
@@ -23,38 +27,62 @@ class SampledShape:
         latent: (d,) latent code.
         log_density: of the latent code (nats).
         nearest_training_distance: distance in z0, in units of sigma, to the nearest training code.
-        mesh: its surface.
+        mesh: its surface; of several components the one of largest volume.
+        rejected: draws of the same seed before this one that were implausible, by reason.
+        plausible: whether this one is; None when it was not asked.
     """
 
     latent: Float[np.ndarray, "d"]
     log_density: float
     nearest_training_distance: float
     mesh: Mesh
+    rejected: Mapping[str, int]
+    plausible: bool | None
 
 
 def draw_shape(
-    model: ShapeModel, seed: int, *, temperature: float = 1.0, spacing_mm: float | None = None
+    model: ShapeModel,
+    seed: int,
+    *,
+    temperature: float = 1.0,
+    spacing_mm: float | None = None,
+    reject: bool = True,
 ) -> SampledShape:
-    """One shape, a pure function of (bundle, seed, temperature, spacing).
+    """One shape, a pure function of (bundle, seed, temperature, spacing, reject).
+
+    The draws of a seed are one stream of base codes; the first that is plausible (`model.inference.plausibility`) is
+    the answer.
 
     Args:
         seed: non-negative.
         temperature: factor on the standard deviations of the base, in (0, 2].
         spacing_mm: grid step of the surface, 0.25 to 10; the model's own when None.
+        reject: draw anew where a shape is implausible.
 
     Raises:
         InvalidParameter: an argument out of its range.
     """
     _check(seed, temperature, spacing_mm)
     sigmas = np.asarray(model.manifest.sigmas)
-    base = temperature * sigmas * np.random.default_rng(seed).standard_normal(len(sigmas))
-    latent = model.prior.from_base(base[None])[0]
+    stream = np.random.default_rng(seed)
+    reasons: list[str] = []
+    for _ in range(MAX_DRAWS if reject else 1):
+        base = temperature * sigmas * stream.standard_normal(len(sigmas))
+        latent = model.prior.from_base(base[None])[0]
+        mesh = surface_of(model, latent, Pose(), spacing_mm, keep_specks=True)
+        reason = implausible(model, mesh) if reject else None
+        if reason is None:
+            break
+        reasons.append(reason)
+    rejected = counted({name: 1} for name in (reasons[:-1] if reason else reasons))
     gap = np.linalg.norm((model.population.base_codes - base) / sigmas, axis=1)
     return SampledShape(
         latent=latent,
         log_density=float(model.prior.log_density(latent[None])[0][0]),
         nearest_training_distance=float(gap.min()),
-        mesh=surface_of(model, latent, Pose(), spacing_mm),
+        mesh=largest_component(mesh)[0],
+        rejected=rejected,
+        plausible=reason is None if reject else None,
     )
 
 

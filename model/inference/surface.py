@@ -22,6 +22,8 @@ def surface_of(
     pose: Pose,
     step_mm: float | None = None,
     discrepancy: Discrepancy | None = None,
+    *,
+    keep_specks: bool = False,
 ) -> Mesh:
     """Watertight surface in world mm, extracted in the canonical frame so that it turns with its input.
 
@@ -30,6 +32,7 @@ def surface_of(
         pose: world to canonical.
         step_mm: grid step in world mm; the model's own when None.
         discrepancy: added to the decoder's field.
+        keep_specks: keep all components; only the one of largest volume otherwise.
     """
     half = canonical_box(model)
     step = (step_mm or model.manifest.resolution_mm) * float(np.exp(pose.log_scale))
@@ -45,7 +48,7 @@ def surface_of(
         slopes = discrepancy.shrinkage(logits[0])[:, None] * by_point[0]
         return discrepancy.corrected(logits[0], points), slopes + discrepancy.slope * discrepancy.gradient(points)
 
-    mesh = extract_surface(field, -half, half, step, gradient=gradient)
+    mesh = extract_surface(field, -half, half, step, gradient=gradient, keep_specks=keep_specks)
     affine = np.eye(4)
     affine[:3, :3] = np.linalg.inv(pose.linear)
     affine[:3, 3] = pose.position

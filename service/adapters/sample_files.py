@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 
 from model.bundle import ShapeModel
+from model.inference.mesh import volume_ml
+from model.inference.plausibility import volume_range_ml
 from model.inference.sampling import SampledShape
+from model.inference.training_pairs import training_pair
 from service import use_cases
+from service.job_results import counts_of
 from service.ports import MeshWriter, SampleFormat, VolumeWriter
 
 MANIFEST = "manifest.json"
-#: Cubic millimetres in a millilitre.
-_MM3_PER_ML = 1000.0
 
 
 @dataclass(frozen=True)
@@ -26,12 +28,14 @@ class Draw:
         temperature: spread of the latent codes; 1 is the population's.
         spacing_mm: grid step; the model's own when None.
         max_voxels: of any grid that is made on the way.
+        reject: draw anew where a shape is implausible.
     """
 
     format: SampleFormat
     temperature: float
     spacing_mm: float | None
     max_voxels: int
+    reject: bool = True
 
 
 @dataclass(frozen=True)
@@ -57,25 +61,47 @@ class SampleWriter:
             InvalidParameter: temperature or spacing out of its range.
             TooLarge: a grid of more voxels than allowed.
         """
-        shape = use_cases.draw(model, seed, how.temperature, how.spacing_mm, how.max_voxels)
+        shape = use_cases.draw(model, seed, how.temperature, how.spacing_mm, how.max_voxels, reject=how.reject)
         name = f"{model.manifest.name}-{seed}.{suffix(how.format)}"
-        return SampleFile(name, self._encode(model, shape, seed, how), _entry(name, shape, seed))
+        data, more = self._encode(model, shape, seed, how)
+        return SampleFile(name, data, {**_entry(name, shape, seed), **more})
 
-    def _encode(self, model: ShapeModel, shape: SampledShape, seed: int, how: Draw) -> bytes:
-        if how.format == SampleFormat.NPZ:
-            return _arrays(shape)
-        if how.format == SampleFormat.NIFTI:
-            spacing = how.spacing_mm or model.manifest.resolution_mm
-            volume = use_cases.label_map(model, shape, spacing, how.max_voxels)
-            return self._write_volume(volume.array, volume.grid, "synthetic shape")
-        return self._write_mesh(
-            shape.mesh, how.format.value, space=model.manifest.frame, metadata={**provenance(model), "seed": seed}
-        )
+    def _encode(self, model: ShapeModel, shape: SampledShape, seed: int, how: Draw) -> tuple[bytes, dict[str, Any]]:
+        """The bytes of a file, and what its entry says beyond that of others."""
+        match how.format:
+            case SampleFormat.NPZ:
+                return _arrays(shape), {}
+            case SampleFormat.NIFTI:
+                volume = _label_map(model, shape, how)
+                return self._write_volume(volume.array, volume.grid, "synthetic shape"), {}
+            case SampleFormat.PAIRS:
+                return _pair(_label_map(model, shape, how), seed)
+        said = {**provenance(model), "seed": seed}
+        return self._write_mesh(shape.mesh, how.format.value, space=model.manifest.frame, metadata=said), {}
+
+
+def _label_map(model: ShapeModel, shape: SampledShape, how: Draw) -> use_cases.Volume:
+    return use_cases.label_map(model, shape, how.spacing_mm or model.manifest.resolution_mm, how.max_voxels)
+
+
+def _pair(volume: use_cases.Volume, seed: int) -> tuple[bytes, dict[str, Any]]:
+    pair = training_pair(volume.array.astype(np.uint8), seed)
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        allow_pickle=False,
+        dense=pair.dense,
+        sparse=pair.sparse,
+        affine=volume.grid.affine,
+        planes=np.array(pair.planes, np.int64).reshape(-1, 2),
+    )
+    return buffer.getvalue(), {"planes": [{"axis": axis, "index": index} for axis, index in pair.planes]}
 
 
 def suffix(format: SampleFormat) -> str:
     """File suffix of a format, without the leading dot."""
-    return "nii.gz" if format == SampleFormat.NIFTI else format.value
+    special = {SampleFormat.NIFTI: "nii.gz", SampleFormat.PAIRS: "npz"}
+    return special.get(format, format.value)
 
 
 def provenance(model: ShapeModel) -> dict[str, object]:
@@ -95,6 +121,9 @@ def manifest_bytes(model: ShapeModel, how: Draw, entries: Sequence[dict[str, Any
         "spacing_mm": how.spacing_mm or manifest.resolution_mm,
         "licence": manifest.licence,
         "attribution": manifest.attribution,
+        "reject": how.reject,
+        "volume_range_ml": list(volume_range_ml(model)),
+        **counts_of(entries),
         "samples": list(entries),
     }
     return json.dumps(document, indent=1).encode()
@@ -106,14 +135,11 @@ def _entry(name: str, shape: SampledShape, seed: int) -> dict[str, Any]:
         "seed": seed,
         "latent": shape.latent.tolist(),
         "log_density_nats": float(shape.log_density),
-        "volume_ml": _volume_ml(shape),
+        "volume_ml": volume_ml(shape.mesh),
         "nearest_training_distance": float(shape.nearest_training_distance),
+        "rejected": dict(shape.rejected),
+        "plausible": shape.plausible,
     }
-
-
-def _volume_ml(shape: SampledShape) -> float:
-    corners = shape.mesh.vertices[shape.mesh.faces]
-    return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0 / _MM3_PER_ML)
 
 
 def _arrays(shape: SampledShape) -> bytes:

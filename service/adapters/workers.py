@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import count
 from typing import Any, TypeVar
 
 from service.errors import Overloaded
@@ -17,23 +18,32 @@ class _Ticket:
 
     def __init__(self, pool: "WorkerPool") -> None:
         self._pool = pool
-        self._pending: Future[Any] | None = None
+        self._pending: set[Future[Any]] = set()
 
     async def run(self, work: Callable[[], T]) -> T:
         """Result of the work; cancelling the wait takes work that has not begun out of the queue."""
         future = self._pool.submit(work)
-        self._pending = future
+        self._pending.add(future)
         try:
             return await asyncio.wrap_future(future)
         finally:
             future.cancel()
+            if future.done():
+                self._pending.discard(future)
 
     def leave(self) -> None:
-        """Free the place, now or as soon as the thread that still works for it is done."""
-        if self._pending is None:
+        """Free the place, now or as soon as the last thread that still works for it is done."""
+        left = list(self._pending)
+        remaining = count(len(left) - 1, -1)
+
+        def end(_: object) -> None:
+            if next(remaining) == 0:
+                self._pool.release()
+
+        for future in left:
+            future.add_done_callback(end)
+        if not left:
             self._pool.release()
-        else:
-            self._pending.add_done_callback(lambda _: self._pool.release())
 
 
 class WorkerPool:

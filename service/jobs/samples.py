@@ -50,4 +50,10 @@ def _draw(tools: JobTools, item: Record, check: Check) -> Record:
 
 
 def _how(tools: JobTools, item: Mapping[str, Any]) -> Draw:
-    return Draw(SampleFormat(item["format"]), item["temperature"], item["spacing_mm"], tools.max_voxels)
+    return Draw(
+        SampleFormat(item["format"]),
+        item["temperature"],
+        item["spacing_mm"],
+        tools.max_voxels,
+        item.get("reject", True),
+    )

@@ -16,7 +16,7 @@ from service.routes.responses import Responses
 #: What depends on the model's digest and the query alone may be kept for ever.
 IMMUTABLE = "max-age=31536000, immutable"
 #: Rises when the program gives another answer to the same query of the same model.
-REVISION = 1
+REVISION = 2
 
 
 def caching_headers(services: Services, model: ShapeModel, kind: str, *query: object) -> dict[str, str]:

@@ -2,7 +2,9 @@
 
 import asyncio
 import threading
-from collections.abc import Callable
+from collections import deque
+from collections.abc import AsyncGenerator, Callable, Iterable
+from itertools import islice
 from typing import TypeVar
 
 from fastapi import Request
@@ -37,6 +39,22 @@ async def run_while_connected(request: Request, ticket: Ticket, work: Callable[[
         gone.set()
         task.cancel()
         listener.cancel()
+
+
+async def in_order(ticket: Ticket, works: Iterable[Callable[[], T]], ahead: int) -> AsyncGenerator[T, None]:
+    """Results of works in their order, at most `ahead` of them begun or waiting to be taken; the rest is not begun."""
+    begun: deque[asyncio.Future[T]] = deque()
+    remaining = iter(works)
+    try:
+        while True:
+            for work in islice(remaining, ahead - len(begun)):
+                begun.append(asyncio.ensure_future(ticket.run(work)))
+            if not begun:
+                return
+            yield await begun.popleft()
+    finally:
+        for future in begun:
+            future.cancel()
 
 
 async def _disconnected(request: Request) -> None:

@@ -29,7 +29,7 @@ Responses = dict[int | str, dict[str, Any]]
 
 def sample_media_type(format: SampleFormat) -> str:
     """Media type of a synthetic shape's file."""
-    other = {SampleFormat.NIFTI: NIFTI, SampleFormat.NPZ: NPZ}
+    other = {SampleFormat.NIFTI: NIFTI, SampleFormat.NPZ: NPZ, SampleFormat.PAIRS: NPZ}
     return other[format] if format in other else MESH_MEDIA_TYPES[MeshFormat(format.value)]
 
 

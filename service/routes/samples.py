@@ -1,6 +1,7 @@
 """``/v1/models/{model}/samples``: synthetic shapes, one or a ZIP that streams while it is made."""
 
 from collections.abc import AsyncIterator
+from contextlib import aclosing
 from functools import partial
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from service import use_cases
 from service.adapters.sample_files import MANIFEST, Draw, SampleWriter, manifest_bytes
 from service.ports import SampleFormat, Ticket
 from service.routes.caching import cached, caching_headers, is_held, not_modified
-from service.routes.connection import run_while_connected
+from service.routes.connection import in_order, run_while_connected
 from service.routes.dependencies import Services, WithModel, WithServices, WithTicket
 from service.routes.models import PATH
 from service.routes.responses import ZIP, attachment, files, problems, sample_media_type
@@ -66,29 +67,32 @@ async def read_batch(
     query: Annotated[BatchQuery, Query()], model: WithModel, services: WithServices, ticket: WithTicket
 ) -> Response:
     """Item i is the shape of `seed` + i, the same as on its own; the manifest comes last."""
-    seeds = use_cases.batch_seeds(query.seed, query.count, services.settings.max_samples)
+    limits = services.settings
+    beyond = f" here; a job of kind samples takes up to {limits.max_job_samples}"
+    seeds = use_cases.batch_seeds(query.seed, query.count, limits.max_samples, beyond)
     how = _draw(services, query)
     use_cases.require_step(model, how.spacing_mm, how.max_voxels)
     writer = SampleWriter(services.write_mesh, services.write_volume)
-    chunks = _zip_chunks(model, seeds, how, writer, ticket)
+    chunks = _zip_chunks(model, seeds, how, writer, ticket, services.settings.workers + 1)
     return StreamingResponse(chunks, media_type=ZIP, headers=attachment(f"{model.manifest.name}-samples.zip"))
 
 
 async def _zip_chunks(
-    model: ShapeModel, seeds: range, how: Draw, writer: SampleWriter, ticket: Ticket
+    model: ShapeModel, seeds: range, how: Draw, writer: SampleWriter, ticket: Ticket, ahead: int
 ) -> AsyncIterator[bytes]:
     archive = ZipStream(sized=False)
     entries = []
-    for seed in seeds:
-        file = await ticket.run(partial(writer.make, model, seed, how))
-        entries.append(file.entry)
-        archive.add(file.data, file.name)
-        for chunk in archive.all_files():
-            yield chunk
+    works = (partial(writer.make, model, seed, how) for seed in seeds)
+    async with aclosing(in_order(ticket, works, ahead)) as made:
+        async for file in made:
+            entries.append(file.entry)
+            archive.add(file.data, file.name)
+            for chunk in archive.all_files():
+                yield chunk
     archive.add(manifest_bytes(model, how, entries), MANIFEST)
     for chunk in archive.finalize():
         yield chunk
 
 
 def _draw(services: Services, query: SampleQuery) -> Draw:
-    return Draw(query.format, query.temperature, query.spacing_mm, services.settings.max_voxels)
+    return Draw(query.format, query.temperature, query.spacing_mm, services.settings.max_voxels, query.reject)
