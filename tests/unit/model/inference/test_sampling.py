@@ -113,7 +113,7 @@ def test_ends_of_the_ranges_are_accepted(arguments):
 
 def with_volumes(*volumes):
     """The analytic model, its training population of these volumes (mL)."""
-    return replace(MODEL, population=replace(MODEL.population, volumes_ml=np.array(volumes)))
+    return replace(MODEL, population=replace(MODEL.population, volumes_ml=np.resize(np.array(volumes), 64)))
 
 
 def test_volumes_out_of_range_are_drawn_anew_from_the_seeds_own_stream():
@@ -164,8 +164,7 @@ class TwinDecoder(EllipsoidDecoder):
 
 
 def test_several_components_are_rejected():
-    small = replace(MODEL, decoder=TwinDecoder(mean_axes=(6.0, 6.0, 6.0)))
-    wide = replace(small, population=replace(small.population, volumes_ml=np.array([0.1, 10.0])))
+    wide = replace(with_volumes(0.1, 10.0), decoder=TwinDecoder(mean_axes=(6.0, 6.0, 6.0)))
     for seed in range(4):
         draws = np.random.default_rng(seed).standard_normal((MAX_DRAWS, 3))
         first = int(np.argmax(draws[:, 0] <= 0))
@@ -176,12 +175,11 @@ def test_several_components_are_rejected():
 
 def test_the_border_of_the_box_and_emptiness_are_implausible():
     ball = mesh_of(*ball_surface(5.0))
-    volumes = replace(MODEL, population=replace(MODEL.population, volumes_ml=np.array([0.4, 0.6])))
+    volumes = with_volumes(0.4, 0.6)
+    aside = np.array([canonical_box(MODEL)[0] - 4.0, 0.0, 0.0])
     assert implausible(volumes, ball) is None
     assert implausible(volumes, empty_mesh()) == "empty"
-    assert (
-        implausible(volumes, replace(ball, vertices=ball.vertices + [canonical_box(MODEL)[0] - 4.0, 0, 0])) == "border"
-    )
+    assert implausible(volumes, replace(ball, vertices=ball.vertices + aside)) == "border"
     assert implausible(MODEL, replace(ball, vertices=0.1 * ball.vertices)) == "volume"
 
 
