@@ -76,7 +76,8 @@ def strokes(browser: Browser, address: str, repeats: int) -> list[float]:
     seconds = []
     for number in range(repeats + 1):
         before = page.locator(".split").locator("visible=true").get_attribute("data-latency")
-        drag_ellipse(page, ("sagittal", "coronal")[number % 2], 0.2 + 0.01 * number, 0.1 + 0.005 * number)
+        plane, across, down = (("sagittal", 0.22, 0.09), ("coronal", 0.1, 0.09))[number % 2]
+        drag_ellipse(page, plane, across + 0.004 * number, down + 0.004 * number)
         seconds.append(latency(page, ".split", before))
     page.context.close()
     return seconds[1:]

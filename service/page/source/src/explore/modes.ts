@@ -12,7 +12,7 @@ import { PLAIN_LOOK, SurfaceView } from '../viewer'
 const SHOWN = 6
 const FARTHEST_SD = 3
 /** While a slider moves the grid is this much coarser than the model's; the full one follows. */
-const COARSER = 1.5
+const COARSER = 2
 const REST_MS = 250
 
 export class Modes {
