@@ -17,8 +17,10 @@ from training.samples import Batch, PointPool, ShapePoints
 
 #: Standard deviation of the codes' noise with the denoising objective.
 NOISE = 0.1
-#: Called after each step with the step's number and its figures.
+#: Called after each step with the step's number and its figures, which are read every `READ_EVERY` steps only.
 Watch = Callable[[int, dict[str, float]], None]
+#: Reading a figure makes the device wait, so it is not done each step.
+READ_EVERY = 50
 
 
 class AutoDecoder(nn.Module):
@@ -108,8 +110,8 @@ class Trainer:
         generator = torch.Generator(device=device).manual_seed(config.seed)
         return cls(config, module, PointPool(shapes, device), _optimiser(module, config), generator)
 
-    def advance(self) -> dict[str, float]:
-        """One optimiser step; returns its figures."""
+    def advance(self, *, read: bool = True) -> dict[str, float]:
+        """One optimiser step; returns its figures, or none when they are not to be read from the device."""
         config = self.config
         self._schedule()
         size = min(config.batch_shapes, self.pool.size)
@@ -121,7 +123,7 @@ class Trainer:
         nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
         self.optimiser.step()
         self.step += 1
-        return {name: value.item() for name, value in terms.items()}
+        return {name: value.item() for name, value in terms.items()} if read else {}
 
     def _schedule(self) -> None:
         progress = self.step / self.config.steps
@@ -166,6 +168,7 @@ def _optimiser(module: AutoDecoder, config: TrainingConfig) -> torch.optim.Optim
     return torch.optim.AdamW(
         [{"name": n, "params": p, "lr": r, "full_lr": r, "weight_decay": w} for n, p, r, w in groups],
         betas=(0.9, 0.99),
+        fused=True,
     )
 
 
@@ -173,7 +176,8 @@ def train(trainer: Trainer, folder: Path, watch: Watch = lambda step, figures: N
     """Run to the configured number of steps with checkpoints in ``folder/checkpoint.pt``."""
     folder.mkdir(parents=True, exist_ok=True)
     while trainer.step < trainer.config.steps:
-        figures = trainer.advance()
+        following = trainer.step + 1
+        figures = trainer.advance(read=following % READ_EVERY == 0 or following == trainer.config.steps)
         watch(trainer.step, figures)
         if trainer.step % trainer.config.checkpoint_every == 0 or trainer.step == trainer.config.steps:
             trainer.save(folder / "checkpoint.pt")

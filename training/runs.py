@@ -23,8 +23,6 @@ RECORD = "run.json"
 FIGURES = "figures"
 #: Evenly spaced held-out shapes that are measured during training, at most.
 VALIDATED = 32
-#: Figures are logged every so many steps.
-LOG_EVERY = 50
 
 Watch = Callable[[int, dict[str, float]], None]
 
@@ -141,9 +139,8 @@ def _validating_watch(trainer: Trainer, cohort: Cohort, writer: SummaryWriter, w
 
 def _logging_watch(writer: SummaryWriter, watch: Watch) -> Watch:
     def both(step: int, figures: dict[str, float]) -> None:
-        if step % LOG_EVERY == 0:
-            for name, value in figures.items():
-                writer.add_scalar(name, value, step)
+        for name, value in figures.items():
+            writer.add_scalar(name, value, step)
         watch(step, figures)
 
     return both
