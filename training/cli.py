@@ -13,8 +13,10 @@ import typer
 
 from model.errors import InvalidParameter
 from training.choices import DeviceName, ObjectiveName, RegimeName, SplitName, configured, with_batches, with_duration
-from training.cohorts import Cohort, CohortName, CohortOptions
-from training.console import exit_status, finding_counts, open_cohort, progress, tell_findings
+from training.cohort_options import takes_cohort
+from training.cohorts import Cohort, CohortOptions
+from training.cohorts.sources import CohortSource, open_cohort
+from training.console import exit_status, finding_counts, progress, tell_findings
 
 if TYPE_CHECKING:
     from model.bundle import ShapeModel
@@ -24,14 +26,6 @@ if TYPE_CHECKING:
     from training.sparsify import Regime
 
 
-CohortOption = Annotated[CohortName | None, typer.Option("--cohort", help="A public cohort below the data folder.")]
-MasksOption = Annotated[Path | None, typer.Option("--masks", help="A folder of NIfTI, NRRD or MetaImage masks.")]
-LabelOption = Annotated[list[int] | None, typer.Option("--label", help="Label of the object in --masks; may repeat.")]
-DataOption = Annotated[
-    Path | None, typer.Option("--data", envvar="MORPHOFLOW_DATA", help="Folder that holds the public cohorts.")
-]
-SkipOption = Annotated[bool, typer.Option("--skip-refused", help="Go on without masks that must not be used.")]
-ShippableOption = Annotated[bool, typer.Option("--shippable", help="Only masks whose licence lets weights ship.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Write the result as JSON.")]
 
 
@@ -43,11 +37,10 @@ def register(app: typer.Typer) -> None:
     app.command("evaluate")(evaluate)
 
 
+@takes_cohort
 def train(
-    cohort: CohortOption = None,
-    masks: MasksOption = None,
-    label: LabelOption = None,
-    data: DataOption = None,
+    source: CohortSource,
+    options: CohortOptions,
     regime: Annotated[RegimeName, typer.Option(help="How sparse the training masks are made.")] = RegimeName.DENSE,
     objective: Annotated[ObjectiveName, typer.Option(help="What is minimised.")] = ObjectiveName.VARIATIONAL,
     latent_size: Annotated[int, typer.Option(min=1, max=1024, help="Dimensions of the latent code.")] = 64,
@@ -62,23 +55,19 @@ def train(
             help="Whether mirror images join the training shapes; of public cohorts without a side they do.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of validation persons, drawings and training.")] = 0,
     device: Annotated[DeviceName, typer.Option(help="Where to compute.")] = DeviceName.AUTO,
     output: Annotated[Path | None, typer.Option(help="Folder of the run.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in the output folder.")] = False,
-    skip_refused: SkipOption = False,
-    shippable: ShippableOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Train a shape model on a cohort of masks."""
     with exit_status():
-        options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
-        found = open_cohort(cohort, masks, data, options, labels=tuple(label or ()))
+        found = open_cohort(source, options)
         tell_findings(found)
-        known = cohort is not None and found.reflects and objective is not ObjectiveName.PAPER
+        known = source.cohort is not None and found.reflects and objective is not ObjectiveName.PAPER
         paired = known if reflect is None else reflect
         config = configured(
-            objective, regime, latent_size, flow=flow, ard=ard, reflected=paired, seed=seed, device=device
+            objective, regime, latent_size, flow=flow, ard=ard, reflected=paired, seed=options.seed, device=device
         )
         codes = (2 if paired else 1) * len(found.train)
         config = with_duration(with_batches(config, codes), steps, epochs, codes)
@@ -103,15 +92,11 @@ def export(
         typer.echo(json.dumps(summary) if as_json else f"{manifest.name} {manifest.version} written to {output}")
 
 
+@takes_cohort
 def calibrate(
+    source: CohortSource,
+    options: CohortOptions,
     bundle: Annotated[Path, typer.Argument(help="Folder of an exported bundle; its manifest is rewritten.")],
-    cohort: CohortOption = None,
-    masks: MasksOption = None,
-    label: LabelOption = None,
-    data: DataOption = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of validation persons; the one used in training.")] = 0,
-    skip_refused: SkipOption = False,
-    shippable: ShippableOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Choose on validation shapes how much a drawn mm^2 is worth and how far slices are followed; record both."""
@@ -119,8 +104,7 @@ def calibrate(
         from model.bundle import read_manifest
         from training.calibration import PRECISIONS, calibrate_bundle
 
-        options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
-        found = open_cohort(cohort, masks, data, options, labels=tuple(label or ()))
+        found = open_cohort(source, options)
         if not found.validation:
             raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
         with progress(len(PRECISIONS) + 1, f"calibrating on {found.name}") as bar:
@@ -141,21 +125,17 @@ def calibrate(
         typer.echo(json.dumps(summary) if as_json else words)
 
 
+@takes_cohort
 def evaluate(
+    source: CohortSource,
+    options: CohortOptions,
     model: Annotated[str, typer.Option(help="Name of a shipped model, or the folder of a bundle.")],
-    cohort: CohortOption = None,
-    masks: MasksOption = None,
-    label: LabelOption = None,
-    data: DataOption = None,
     split: Annotated[SplitName, typer.Option(help="Which held-out cases.")] = SplitName.TEST,
     regime: Annotated[list[RegimeName] | None, typer.Option(help="May repeat; thin, thick and orthogonal.")] = None,
     offset: Annotated[int | None, typer.Option(min=0, help="First drawn slice; centred when left out.")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Measure only so many cases.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of validation persons and reconstructions.")] = 0,
     output: Annotated[Path | None, typer.Option(help="CSV file with every case.")] = None,
     record: Annotated[bool, typer.Option("--record", help="Write the figures into the bundle's manifest.")] = False,
-    skip_refused: SkipOption = False,
-    shippable: ShippableOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure a model on held-out masks, beside interpolation without a model."""
@@ -164,14 +144,13 @@ def evaluate(
         from training.report import as_json as json_of
         from training.report import as_text, record_accuracy, summarise, write_csv
 
-        options = CohortOptions(seed=seed, skip_refused=skip_refused, shippable_only=shippable)
         opened = open_named(model)
-        found = open_cohort(cohort, masks, data, options, labels=tuple(label or ()))
+        found = open_cohort(source, options)
         cases = found.of_split(split.value)[:limit]
         if not cases:
             raise InvalidParameter(f"The cohort has no {split} cases; the other split is accepted.", part="split")
         regimes = tuple(regime or (RegimeName.THIN, RegimeName.THICK, RegimeName.ORTHOGONAL))
-        measured = _evaluate_with_progress(opened, cases, regimes, offset, seed)
+        measured = _evaluate_with_progress(opened, cases, regimes, offset, options.seed)
         if output is not None:
             output.parent.mkdir(parents=True, exist_ok=True)
             with output.open("w", newline="", encoding="utf-8") as stream:

@@ -1,16 +1,15 @@
-"""What the training commands have in common: exit status, cohorts from options, progress on a terminal."""
+"""What the training commands have in common: exit status, findings, progress on a terminal."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from model.errors import CohortError, InputError, InvalidParameter, MorphoFlowError, NotFound
-from training.cohorts import Cohort, CohortName, CohortOptions, data_folder, load_cohort, read_folder
+from model.errors import CohortError, InputError, MorphoFlowError, NotFound
+from training.cohorts import Cohort
 
 #: Errors that the caller can mend.
 BAD_INPUT = (InputError, CohortError, NotFound)
@@ -39,24 +38,6 @@ def progress(total: int, words: str) -> Iterator[Progress]:
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
         bar.add_task(words, total=total)
         yield bar
-
-
-def open_cohort(
-    name: CohortName | None, masks: Path | None, data: Path | None, options: CohortOptions, labels: Sequence[int]
-) -> Cohort:
-    """The public cohort or the folder of masks that was asked for.
-
-    Raises:
-        InvalidParameter: none or both were named.
-        CohortError: it cannot be used.
-    """
-    if (name is None) == (masks is None):
-        raise InvalidParameter("Either --cohort or --masks must be given; one of them is accepted.", part="cohort")
-    if name is not None:
-        return load_cohort(name, data_folder(data), options)
-    if options.shippable_only:
-        raise InvalidParameter("A folder of masks has no licence; --shippable goes with --cohort.", part="shippable")
-    return read_folder(Path(masks or ""), options, labels=labels)
 
 
 def tell_findings(cohort: Cohort) -> None:

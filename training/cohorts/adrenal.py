@@ -5,17 +5,12 @@ Its training array is the training split, its validation array the test split. B
 cannot be told, so that the held-out validation cases may share persons with the training cases.
 """
 
-import zipfile
 from pathlib import Path
-from typing import Literal
-
-import numpy as np
-from jaxtyping import Shaped
 
 from model.errors import CohortError
-from model.geometry import Grid
 from training.cohorts.assemble import CohortOptions, assemble
-from training.cohorts.cohort import Case, Cohort, Provenance
+from training.cohorts.cohort import Cohort, Provenance
+from training.cohorts.medmnist import read_arrays
 
 ARCHIVE = "adrenalmnist3d_64.npz"
 PROVENANCE = Provenance(
@@ -32,17 +27,8 @@ def load(root: Path, options: CohortOptions) -> Cohort:
     Raises:
         CohortError: not there, not readable, or not fit to be used.
     """
-    try:
-        with np.load(root / "adrenal" / ARCHIVE) as archive:
-            cases = [*_cases(archive["train_images"], "train"), *_cases(archive["val_images"], "test")]
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise CohortError(
-            "No archive of adrenal glands was found below the data folder; name the folder with --data."
-        ) from error
+    path = root / "adrenal" / ARCHIVE
+    if not path.is_file():
+        raise CohortError("No archive of adrenal glands was found below the data folder; name the folder with --data.")
+    cases = read_arrays(path, "adrenal", splits={"train_images": "train", "val_images": "test"})
     return assemble("adrenal", cases, (), PROVENANCE, options, side="mixed")
-
-
-def _cases(images: Shaped[np.ndarray, "n i j k"], split: Literal["train", "test"]) -> list[Case]:
-    grid = Grid((images.shape[1], images.shape[2], images.shape[3]), np.eye(4))
-    names = (f"adrenal_{split}_{number:04d}" for number in range(len(images)))
-    return [Case(name, name, split, image != 0, grid) for name, image in zip(names, images, strict=True)]

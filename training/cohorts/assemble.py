@@ -15,12 +15,14 @@ class CohortOptions:
     Attributes:
         seed: of the choice of validation persons.
         validation_fraction: share of the training persons held out.
+        test_fraction: share of the persons held out for measuring where the cohort has no test split.
         skip_refused: go on without the refused cases; otherwise any refusal ends in `CohortError`.
         shippable_only: only cases from which weights may be shipped.
     """
 
     seed: int = 0
     validation_fraction: float = 0.2
+    test_fraction: float = 0.0
     skip_refused: bool = False
     shippable_only: bool = False
 
@@ -72,7 +74,8 @@ def _merged(refused: Iterable[Refusal]) -> list[Refusal]:
 
 
 def _split(cohort: Cohort, options: CohortOptions) -> Cohort:
-    cases = hold_out(cohort.train, fraction=options.validation_fraction, seed=options.seed)
+    cases = hold_out(cohort.train, fraction=options.test_fraction, seed=options.seed, split="test")
+    cases = hold_out(cases, fraction=options.validation_fraction, seed=options.seed)
     divided = divided_persons(cases)
     if divided:
         raise CohortError(

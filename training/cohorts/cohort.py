@@ -109,19 +109,19 @@ class Cohort:
         return {"train": self.train, "validation": self.validation, "test": self.test}[split]
 
 
-def hold_out(cases: Sequence[Case], *, fraction: float, seed: int) -> tuple[Case, ...]:
-    """Move a share of the training persons to validation, all cases of a person together.
+def hold_out(cases: Sequence[Case], *, fraction: float, seed: int, split: Split = "validation") -> tuple[Case, ...]:
+    """Move a share of the training persons to another split, all cases of a person together.
 
     The choice depends on the persons and the seed, not on the order of the cases. One person at the
-    least is held out, unless there is only one. Nothing moves when a validation split exists already.
+    least is held out, unless there is only one. Nothing moves when the split exists already.
     """
     persons = sorted({case.person for case in cases if case.split == "train"})
-    if len(persons) < 2 or fraction <= 0 or any(case.split == "validation" for case in cases):
+    if len(persons) < 2 or fraction <= 0 or any(case.split == split for case in cases):
         return tuple(cases)
     count = min(max(1, round(fraction * len(persons))), len(persons) - 1)
     held = set(np.random.default_rng(seed).permutation(persons)[:count].tolist())
     return tuple(
-        replace(case, split="validation") if case.split == "train" and case.person in held else case for case in cases
+        replace(case, split=split) if case.split == "train" and case.person in held else case for case in cases
     )
 
 

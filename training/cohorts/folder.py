@@ -14,7 +14,7 @@ from typing import cast
 from model.errors import CohortError, InputError
 from training.cohorts.assemble import CohortOptions, assemble
 from training.cohorts.cohort import Case, Cohort, Provenance, Refusal, Split
-from training.cohorts.reading import is_mask_file, read_mask, stem
+from training.cohorts.reading import MaskFile, is_mask_file, read_mask, stem
 
 Row = Mapping[str, str]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -66,9 +66,12 @@ def read_table(path: Path, keep: Callable[[Row], bool] = lambda row: True) -> di
 
 
 def read_cases(
-    files: Collection[Path], rows: Mapping[str, Row], labels: Collection[int] = ()
+    files: Collection[Path],
+    rows: Mapping[str, Row],
+    labels: Collection[int] = (),
+    read: Callable[[Path], MaskFile] | None = None,
 ) -> tuple[list[Case], list[Refusal]]:
-    """Cases of the files that can be read, and refusals of those that cannot."""
+    """Cases of the files that can be read, and refusals of those that cannot; ``read`` makes a mask of a file."""
     cases: list[Case] = []
     refused: list[Refusal] = []
     taken: set[str] = set()
@@ -81,14 +84,14 @@ def read_cases(
             continue
         taken.add(case_name)
         try:
-            cases.append(_read_case(path, rows.get(case_name, {}), labels))
+            found = read(path) if read is not None else read_mask(path, labels)
+            cases.append(_case(path, rows.get(case_name, {}), found))
         except InputError as error:
             refused.append(Refusal(case_name, str(error)))
     return cases, refused
 
 
-def _read_case(path: Path, row: Row, labels: Collection[int]) -> Case:
-    found = read_mask(path, labels)
+def _case(path: Path, row: Row, found: MaskFile) -> Case:
     name = stem(path)
     by_folder = next((split for split in SPLITS if path.parent.name == split), "train")
     split = cast(Split, row.get("split") or by_folder)

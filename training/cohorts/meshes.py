@@ -1,0 +1,179 @@
+"""A folder of watertight meshes: STL, PLY, OBJ, legacy VTK and VTP, made masks of by VTK's stencil.
+
+A voxel belongs to the object when its centre lies inside the surface. Splits and persons come from ``cases.csv`` and
+from folders named train, validation and test, as for masks. Coordinates are mm; files of LPS programs are turned to
+RAS.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonCore import VTK_UNSIGNED_CHAR, vtkObject
+from vtkmodules.vtkCommonDataModel import vtkImageData
+from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkFeatureEdges, vtkTriangleFilter
+from vtkmodules.vtkImagingStencil import vtkImageStencil, vtkPolyDataToImageStencil
+from vtkmodules.vtkIOGeometry import vtkOBJReader, vtkSTLReader
+from vtkmodules.vtkIOLegacy import vtkPolyDataReader
+from vtkmodules.vtkIOPLY import vtkPLYReader
+from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+from model.errors import CohortError, InvalidMask, UnreadableImage
+from model.geometry import Grid
+from training.cohorts.assemble import CohortOptions, assemble
+from training.cohorts.cohort import Cohort, Provenance, Refusal
+from training.cohorts.folder import read_cases, read_table
+from training.cohorts.reading import MaskFile, stem
+from training.cohorts.voxelising import SpaceName, Voxelising
+
+READERS: dict[str, Callable[[], Any]] = {
+    ".stl": vtkSTLReader,
+    ".ply": vtkPLYReader,
+    ".obj": vtkOBJReader,
+    ".vtk": vtkPolyDataReader,
+    ".vtp": vtkXMLPolyDataReader,
+}
+SUFFIXES = tuple(READERS)
+OWN_MESHES = Provenance("meshes of the caller", "not stated", "", shippable=False)
+ONE_MM = Voxelising()
+#: Room of background around a mesh (mm), and the most voxels that one may become.
+MARGIN_MM = 4.0
+MOST_VOXELS = 100_000_000
+#: Extents that anatomy in mm has.
+EXTENT_RANGE_MM = (2.0, 2000.0)
+
+
+def read_meshes(folder: Path, options: CohortOptions, *, how: Voxelising = ONE_MM) -> Cohort:
+    """Every mesh below a folder as a cohort of masks.
+
+    Raises:
+        CohortError: no folder, a table that cannot be used, or what `assemble` refuses.
+    """
+    if not folder.is_dir():
+        raise CohortError("The folder of meshes does not exist; an existing folder is accepted.")
+    rows = read_table(folder / "cases.csv")
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and is_mesh_file(path))
+    if not files:
+        raise CohortError(f"The folder holds no mesh; {', '.join(SUFFIXES)} are accepted.")
+    cases, refused = read_cases(files, rows, read=lambda path: read_mesh(path, how))
+    absent = rows.keys() - {stem(path) for path in files}
+    refused += [Refusal(case, "the table lists it but its file is missing") for case in sorted(absent)]
+    return assemble(folder.resolve().name, cases, refused, OWN_MESHES, options)
+
+
+def is_mesh_file(path: Path) -> bool:
+    """Whether the suffix is one that `read_mesh` takes."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+
+
+def read_mesh(path: Path, how: Voxelising) -> MaskFile:
+    """A mesh file as a mask.
+
+    Raises:
+        UnreadableImage: no mesh, or one that ends too early.
+        InvalidMask: a surface that is not closed, or one of a size that anatomy in mm has not.
+    """
+    surface = closed_surface(path)
+    return voxelised(surface, how)
+
+
+def closed_surface(path: Path) -> Any:
+    """The triangles of a file (``vtkPolyData``), equal points merged.
+
+    Raises:
+        UnreadableImage: no mesh, or one that ends too early.
+        InvalidMask: edges that do not belong to exactly two triangles.
+    """
+    reader = READERS[path.suffix.lower()]()
+    reader.SetFileName(str(path))
+    triangles, clean = vtkTriangleFilter(), vtkCleanPolyData()
+    triangles.SetPassLines(False)
+    triangles.SetPassVerts(False)
+    triangles.SetInputConnection(reader.GetOutputPort())
+    clean.SetInputConnection(triangles.GetOutputPort())
+    with _quiet():
+        clean.Update()
+    surface = clean.GetOutput()
+    if reader.GetErrorCode() or surface.GetNumberOfPolys() == 0:
+        raise UnreadableImage("the file cannot be read; a complete mesh of triangles is accepted", part=stem(path))
+    edges = _bad_edges(surface)
+    if edges:
+        raise InvalidMask(
+            f"the mesh is not watertight: {edges} edge(s) do not belong to exactly two triangles; "
+            "a closed surface is accepted",
+            part=stem(path),
+        )
+    return surface
+
+
+def voxelised(surface: Any, how: Voxelising) -> MaskFile:
+    """Voxels whose centres lie inside a closed surface.
+
+    Raises:
+        InvalidMask: an extent that anatomy in mm has not, or more than `MOST_VOXELS`.
+    """
+    bounds = np.reshape(surface.GetBounds(), (3, 2))
+    extent = float(np.ptp(bounds, axis=1).max())
+    low, high = EXTENT_RANGE_MM
+    if not low <= extent <= high:
+        raise InvalidMask(
+            f"the mesh is {extent:.3g} mm long; coordinates in mm, {low:g} to {high:g} long, are accepted"
+        )
+    # Half a step off round numbers, so that no centre lies on a face of a mesh that was made of voxels.
+    lower = np.floor((bounds[:, 0] - MARGIN_MM) / how.spacing_mm) * how.spacing_mm + 0.5 * how.spacing_mm
+    shape = np.ceil((bounds[:, 1] + MARGIN_MM - lower) / how.spacing_mm).astype(int) + 1
+    if shape.astype(float).prod() > MOST_VOXELS:
+        raise InvalidMask(f"the mesh would have over {MOST_VOXELS} voxels; a larger spacing is accepted")
+    mask = _stencil(surface, lower, shape, how.spacing_mm)
+    affine = np.diag([how.spacing_mm] * 3 + [1.0])
+    affine[:3, 3] = lower
+    if how.space is SpaceName.LPS:
+        affine = np.diag([-1.0, -1.0, 1.0, 1.0]) @ affine
+    return MaskFile(mask, Grid((int(shape[0]), int(shape[1]), int(shape[2])), affine))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep VTK's own words on a bad file from the caller."""
+    shown = vtkObject.GetGlobalWarningDisplay()
+    vtkObject.SetGlobalWarningDisplay(0)
+    try:
+        yield
+    finally:
+        vtkObject.SetGlobalWarningDisplay(shown)
+
+
+def _stencil(surface: Any, lower: Float[np.ndarray, "3"], shape: Any, spacing_mm: float) -> Bool[np.ndarray, "i j k"]:
+    image = vtkImageData()
+    image.SetOrigin(*lower.tolist())
+    image.SetSpacing(spacing_mm, spacing_mm, spacing_mm)
+    image.SetDimensions(*shape.tolist())
+    image.AllocateScalars(VTK_UNSIGNED_CHAR, 1)
+    vtk_to_numpy(image.GetPointData().GetScalars())[:] = 1
+    inside, cut = vtkPolyDataToImageStencil(), vtkImageStencil()
+    inside.SetInputData(surface)
+    inside.SetOutputOrigin(*lower.tolist())
+    inside.SetOutputSpacing(spacing_mm, spacing_mm, spacing_mm)
+    inside.SetOutputWholeExtent(image.GetExtent())
+    inside.SetTolerance(0.0)
+    cut.SetInputData(image)
+    cut.SetStencilConnection(inside.GetOutputPort())
+    cut.SetBackgroundValue(0)
+    cut.Update()
+    values = vtk_to_numpy(cut.GetOutput().GetPointData().GetScalars())
+    return np.asarray(values.reshape(shape, order="F") != 0)
+
+
+def _bad_edges(surface: Any) -> int:
+    edges = vtkFeatureEdges()
+    edges.SetInputData(surface)
+    edges.BoundaryEdgesOn()
+    edges.NonManifoldEdgesOn()
+    edges.FeatureEdgesOff()
+    edges.ManifoldEdgesOff()
+    edges.Update()
+    return int(edges.GetOutput().GetNumberOfCells())
