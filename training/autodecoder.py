@@ -100,6 +100,7 @@ class Trainer:
     optimiser: torch.optim.Optimizer
     generator: torch.Generator
     step: int = 0
+    finished: bool = False
 
     @classmethod
     def start(cls, config: TrainingConfig, shapes: Sequence[ShapePoints]) -> "Trainer":
@@ -140,6 +141,7 @@ class Trainer:
         state = {
             "config": self.config.as_dict(),
             "step": self.step,
+            "finished": self.finished or self.step == self.config.steps,
             "module": self.module.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
@@ -155,6 +157,7 @@ class Trainer:
         self.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["generator"].cpu())
         self.step = state["step"]
+        self.finished = bool(state.get("finished", False))
 
 
 def _optimiser(module: AutoDecoder, config: TrainingConfig) -> torch.optim.Optimizer:
@@ -175,10 +178,11 @@ def _optimiser(module: AutoDecoder, config: TrainingConfig) -> torch.optim.Optim
 def train(trainer: Trainer, folder: Path, watch: Watch = lambda step, figures: None) -> AutoDecoder:
     """Run to the configured number of steps with checkpoints in ``folder/checkpoint.pt``."""
     folder.mkdir(parents=True, exist_ok=True)
-    while trainer.step < trainer.config.steps:
+    while trainer.step < trainer.config.steps and not trainer.finished:
         following = trainer.step + 1
         figures = trainer.advance(read=following % READ_EVERY == 0 or following == trainer.config.steps)
         watch(trainer.step, figures)
-        if trainer.step % trainer.config.checkpoint_every == 0 or trainer.step == trainer.config.steps:
+        last = trainer.finished or trainer.step == trainer.config.steps
+        if last or trainer.step % trainer.config.checkpoint_every == 0:
             trainer.save(folder / "checkpoint.pt")
     return trainer.module

@@ -15,6 +15,10 @@ BATCH_SHARE, BATCH_RANGE = 4, (32, 128)
 STEP_POINTS, MOST_POINTS = 8192, 256
 
 
+#: Validations of a run with early stopping.
+VALIDATIONS = 20
+
+
 class RegimeName(StrEnum):
     """How sparse the drawings are."""
 
@@ -127,3 +131,11 @@ def with_duration(config: "TrainingConfig", steps: int | None, epochs: int | Non
     if epochs is not None:
         steps = epochs * -(-shapes // min(config.batch_shapes, shapes))
     return config if steps is None else replace(config, steps=steps)
+
+
+def with_patience(config: "TrainingConfig", patience: int) -> "TrainingConfig":
+    """The configuration with early stopping: twenty validations a run, and an end after ``patience`` without gain."""
+    if patience == 0:
+        return config
+    every = max(1, config.steps // VALIDATIONS)
+    return replace(config, patience=patience, validate_every=every)

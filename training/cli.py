@@ -12,11 +12,22 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from model.errors import InvalidParameter
-from training.choices import DeviceName, ObjectiveName, RegimeName, SplitName, configured, with_batches, with_duration
+from training.choices import (
+    DeviceName,
+    ObjectiveName,
+    RegimeName,
+    SplitName,
+    configured,
+    with_batches,
+    with_duration,
+    with_patience,
+)
 from training.cohort_options import takes_cohort
 from training.cohorts import Cohort, CohortOptions
 from training.cohorts.sources import CohortSource, open_cohort
 from training.console import exit_status, finding_counts, progress, tell_findings
+from training.reporting.command import report
+from training.sweep.command import sweep
 
 if TYPE_CHECKING:
     from model.bundle import ShapeModel
@@ -35,6 +46,8 @@ def register(app: typer.Typer) -> None:
     app.command("export")(export)
     app.command("calibrate")(calibrate)
     app.command("evaluate")(evaluate)
+    app.command("sweep")(sweep)
+    app.command("report")(report)
 
 
 @takes_cohort
@@ -55,6 +68,9 @@ def train(
             help="Whether mirror images join the training shapes; of public cohorts without a side they do.",
         ),
     ] = None,
+    patience: Annotated[
+        int, typer.Option(min=0, help="End after so many validations without a better figure; 0 never does.")
+    ] = 0,
     device: Annotated[DeviceName, typer.Option(help="Where to compute.")] = DeviceName.AUTO,
     output: Annotated[Path | None, typer.Option(help="Folder of the run.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in the output folder.")] = False,
@@ -70,7 +86,7 @@ def train(
             objective, regime, latent_size, flow=flow, ard=ard, reflected=paired, seed=options.seed, device=device
         )
         codes = (2 if paired else 1) * len(found.train)
-        config = with_duration(with_batches(config, codes), steps, epochs, codes)
+        config = with_patience(with_duration(with_batches(config, codes), steps, epochs, codes), patience)
         folder = output or Path("runs") / f"{found.name}-{regime}"
         figures = _train_with_progress(found, config, folder, resume=resume)
         _print_run(found, config, folder, figures, as_json=as_json)

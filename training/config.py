@@ -48,6 +48,7 @@ class TrainingConfig:
             steps) and fall to zero along a cosine.
         reflected: whether each training shape is joined by its mirror image (left and right exchanged), which belongs
             to the population where sides are mixed or the structure is symmetric.
+        patience: validations without a better figure after which the run ends with its best module; 0 never ends it.
         flow_start: share of steps after which the flow is trained; it is the identity before.
     """
 
@@ -70,6 +71,7 @@ class TrainingConfig:
     device: str = "cpu"
     checkpoint_every: int = 500
     validate_every: int = 1000
+    patience: int = 0
 
     def as_dict(self) -> dict[str, Any]:
         """Nested plain values, for JSON."""

@@ -99,7 +99,7 @@ def load_module(run: Path, config: TrainingConfig, shapes: int) -> AutoDecoder:
     """
     path = run / CHECKPOINT
     state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True) if path.is_file() else {"step": 0}
-    if state["step"] < config.steps:
+    if state["step"] < config.steps and not state.get("finished", False):
         raise InvalidParameter(
             f"The run stands at step {state['step']} of {config.steps}; a finished run is accepted, see --resume.",
             part="run",

@@ -15,6 +15,7 @@ from training.autodecoder import AutoDecoder, Trainer, train
 from training.cohorts.cohort import Case, Cohort
 from training.config import TrainingConfig, config_from_dict
 from training.points import cohort_points, decoder_extent
+from training.stopping import EarlyStopping
 from training.validation import Validation
 
 CHECKPOINT = "checkpoint.pt"
@@ -53,7 +54,8 @@ def train_cohort(
     (folder / RECORD).write_text(json.dumps(record(cohort, config), indent=2) + "\n", encoding="utf-8")
     with SummaryWriter(folder / FIGURES, purge_step=trainer.step) as writer:
         logging = _logging_watch(writer, watch)
-        return train(trainer, folder, _validating_watch(trainer, cohort, writer, logging))
+        stopping = EarlyStopping(trainer, folder)
+        return train(trainer, folder, _validating_watch(trainer, cohort, writer, logging, stopping))
 
 
 def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
@@ -121,7 +123,9 @@ def _check_folder(folder: Path, wanted: dict[str, Any], *, resume: bool) -> None
         )
 
 
-def _validating_watch(trainer: Trainer, cohort: Cohort, writer: SummaryWriter, watch: Watch) -> Watch:
+def _validating_watch(
+    trainer: Trainer, cohort: Cohort, writer: SummaryWriter, watch: Watch, stopping: EarlyStopping
+) -> Watch:
     config = trainer.config
     if not cohort.validation:
         return watch
@@ -131,8 +135,10 @@ def _validating_watch(trainer: Trainer, cohort: Cohort, writer: SummaryWriter, w
     def validate(step: int, figures: dict[str, float]) -> None:
         watch(step, figures)
         if step % config.validate_every == 0 or step == config.steps:
-            for name, value in validation.figures(trainer.module).items():
+            found = validation.figures(trainer.module)
+            for name, value in found.items():
                 writer.add_scalar(name, value, step)
+            stopping.see(found)
 
     return validate
 

@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import nibabel as nib
 import numpy as np
@@ -36,7 +37,7 @@ def opened(options=OPTIONS, **source):
 class TestSource:
     @pytest.mark.parametrize(
         "source",
-        [{}, {"cohort": CohortName.TALUS, "masks": "."}, {"masks": ".", "meshes": "."}],
+        [{}, {"cohort": CohortName.TALUS, "masks": Path()}, {"masks": Path(), "meshes": Path()}],
     )
     def test_exactly_one_source_is_taken(self, source):
         with pytest.raises(InvalidParameter, match="exactly one"):

@@ -1,0 +1,232 @@
+import csv
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import nibabel as nib
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from model.errors import InvalidParameter
+from training.cli import register
+from training.cohorts import CohortOptions
+from training.cohorts.sources import CohortSource
+from training.sweep.plan import Cell, cells_of
+from training.sweep.priors import PriorName
+from training.sweep.record import read_record, write_record
+from training.sweep.summary import correlation, row_of, write_csv
+from training.sweep.table import Result, append, done, read_results
+from training.sweep.workers import held
+
+QUICK = [
+    "--latent-size",
+    "3",
+    "--steps",
+    "8",
+    "--samples",
+    "4",
+    "--no-calibrate",
+    "--device",
+    "cpu",
+    "--regime",
+    "thin",
+]
+
+
+def result(key="a", **more):
+    measured = {"thin": {"one": {"dice": 0.9, "asd_mm": 0.5, "hd95_mm": 2.0, "hd_mm": 4.0}, "two": None}}
+    values = Result(
+        key, "thin", 4, "flow-ard", 0, "variational", "vertebra", "made here", "CC0", True, 5, 8, 1.5, [1.0, 0.5],
+        [1, 2, 2], [1.0, 2.0, 3.0], [0.1, 0.2, 0.3], measured,
+    )  # fmt: skip
+    return replace(values, **more)
+
+
+def ellipsoid(n):
+    index = np.stack(np.meshgrid(*[np.arange(28)] * 3, indexing="ij"), axis=-1)
+    return (((index - 13.5) / [8.0 + 0.4 * n, 9.0, 10.0 - 0.3 * n]) ** 2).sum(axis=-1) <= 1.0
+
+
+@pytest.fixture(scope="module")
+def masks(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("masks")
+    for n in range(8):
+        split = folder / ("test" if n > 5 else "train")
+        split.mkdir(exist_ok=True)
+        nib.save(nib.Nifti1Image(ellipsoid(n).astype(np.uint8), np.eye(4)), split / f"e{n}.nii.gz")
+    return folder
+
+
+def call(*words):
+    app = typer.Typer()
+    register(app)
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+class TestPlan:
+    def test_every_combination_stands_once(self):
+        cells = cells_of([32, 16, 16], ["thin", "thick"], [PriorName.PLAIN, PriorName.FLOW_ARD], range(3), "paper")
+        assert len(cells) == len({cell.key for cell in cells}) == 2 * 2 * 2 * 3
+        assert [cell.latent_size for cell in cells] == 12 * [16] + 12 * [32]
+
+    def test_dense_cells_are_measured_in_every_sparse_regime(self):
+        assert Cell("dense", 8, PriorName.ARD).measured_in == ("thin", "thick", "orthogonal")
+        assert Cell("thick", 8, PriorName.ARD).measured_in == ("thick",)
+
+    @pytest.mark.parametrize("prior", PriorName)
+    def test_priors_say_what_they_have(self, prior):
+        assert (prior.flow, prior.ard) == ("flow" in prior.value, "ard" in prior.value)
+
+
+class TestTable:
+    def test_what_was_written_is_read(self, tmp_path):
+        for key in "abc":
+            append(tmp_path, result(key))
+        assert read_results(tmp_path) == [result(key) for key in "abc"]
+        assert done(tmp_path) == set("abc")
+
+    def test_a_line_that_a_kill_cut_short_is_passed_over_and_the_next_one_stands_alone(self, tmp_path):
+        append(tmp_path, result("a"))
+        with (tmp_path / "results.jsonl").open("a") as stream:
+            stream.write('{"key": "b", "regi')
+        append(tmp_path, result("c"))
+        assert done(tmp_path) == {"a", "c"}
+
+    def test_processes_write_whole_lines(self, tmp_path):
+        context = multiprocessing.get_context("fork")
+        writers = [context.Process(target=append, args=(tmp_path, result(f"k{n}"))) for n in range(8)]
+        for writer in writers:
+            writer.start()
+        for writer in writers:
+            writer.join()
+        assert done(tmp_path) == {f"k{n}" for n in range(8)}
+
+    def test_rows_hold_means_over_what_was_measured(self, tmp_path):
+        write_csv([result()], tmp_path / "table.csv")
+        (row,) = csv.DictReader((tmp_path / "table.csv").open())
+        assert (float(row["asd_mm_mean"]), row["cases"], row["failed"]) == (0.5, "1", "1")
+        assert float(row["pearson_r"]) == pytest.approx(1.0)
+        assert list(row) == list(row_of(None, ""))
+
+    def test_no_spread_has_no_correlation(self):
+        assert np.isnan(correlation(result(latent=[1.0, 1.0, 1.0])))
+
+    def test_a_folder_without_a_table_is_refused(self, tmp_path):
+        with pytest.raises(InvalidParameter, match="holds no results"):
+            read_results(tmp_path)
+
+
+class TestHolding:
+    def test_a_cell_is_held_once_and_let_go(self, tmp_path):
+        with held(tmp_path / "cell") as mine:
+            assert mine
+            with held(tmp_path / "cell") as other:
+                assert not other
+        with held(tmp_path / "cell") as again:
+            assert again
+
+
+class TestRecord:
+    def test_source_and_options_come_back(self, tmp_path):
+        source = CohortSource(masks=tmp_path, labels=(2, 3), align=True)
+        options = CohortOptions(test_fraction=0.2, skip_refused=True)
+        write_record(tmp_path / "s", source, options)
+        assert read_record(tmp_path / "s") == (source, options)
+
+    def test_a_sweep_of_other_shapes_is_refused(self, tmp_path):
+        write_record(tmp_path / "s", CohortSource(masks=tmp_path), CohortOptions())
+        with pytest.raises(InvalidParameter, match="other shapes"):
+            write_record(tmp_path / "s", CohortSource(masks=tmp_path / "more"), CohortOptions())
+
+
+class TestSweep:
+    @pytest.fixture(scope="class")
+    def swept(self, masks, tmp_path_factory):
+        folder = tmp_path_factory.mktemp("sweep") / "out"
+        words = ("sweep", "--masks", masks, *QUICK, "--output", folder, "--jobs", 1, "--json")
+        return folder, words, call(*words)
+
+    def test_the_table_has_a_line_for_each_cell(self, swept):
+        folder, _, answer = swept
+        assert answer.exit_code == 0, answer.output
+        assert json.loads(answer.stdout.splitlines()[-1])["unfinished"] == 0
+        results = {one.prior: one for one in read_results(folder)}
+        assert set(results) == {"plain", "flow-ard"}
+        for one in results.values():
+            assert list(one.measured["thin"]) == ["e6", "e7"]
+            assert len(one.sigmas) == 3
+        assert len((folder / "results.csv").read_text().splitlines()) == 3
+
+    def test_what_is_there_is_skipped(self, swept):
+        folder, words, _ = swept
+        before = (folder / "results.jsonl").read_bytes()
+        assert call(*words).exit_code == 0
+        assert (folder / "results.jsonl").read_bytes() == before
+
+    def test_an_exported_model_is_a_cell_of_its_own(self, swept, masks, tmp_path):
+        folder, _, _ = swept
+        (bundle,) = (folder / "cells").glob("*-flow-ard-*/bundle")
+        words = ("sweep", "--masks", masks, "--bundle", bundle, "--samples", 3, "--limit", 1, "--jobs", 1)
+        answer = call(*words, "--output", tmp_path / "out")
+        assert answer.exit_code == 0, answer.output
+        (one,) = read_results(tmp_path / "out")
+        assert (one.prior, one.regime, len(one.measured["thin"])) == ("flow-ard", "thin", 1)
+
+    def test_the_report_is_one_file_with_tables_and_panels(self, swept, tmp_path):
+        folder, _, _ = swept
+        answer = call("report", folder, "--output", tmp_path / "page.html", "--command", "made <here>")
+        assert answer.exit_code == 0, answer.output
+        text = (tmp_path / "page.html").read_text(encoding="utf-8")
+        assert all(f"<h3>{letter}. " in text for letter in "ABCDE")
+        assert "made &lt;here&gt;" in text
+        assert text.count("data:image/png;base64,") >= 4
+        assert not any(word in text for word in ("http://", "https://", 'src="/', "<script", "<link"))
+        assert (tmp_path / "page.csv").read_text().count("\n") == 2
+
+    def test_pictures_of_shapes_can_be_withheld(self, swept, tmp_path):
+        folder, _, _ = swept
+        assert call("report", folder, "--output", tmp_path / "page.html", "--published-only").exit_code == 0
+        text = (tmp_path / "page.html").read_text(encoding="utf-8")
+        assert text.count("not to be passed on") == 3
+
+    def test_a_cohort_without_test_shapes_is_refused(self, masks, tmp_path):
+        answer = call("sweep", "--masks", masks / "train", *QUICK, "--output", tmp_path / "out")
+        assert answer.exit_code == 2
+        assert "--test-fraction" in answer.stderr
+
+
+def test_a_killed_sweep_goes_on_from_its_checkpoint(masks, tmp_path, repository):
+    folder = tmp_path / "out"
+    words = ["sweep", "--masks", str(masks), *QUICK, "--steps", "1200", "--prior", "plain", "--output", str(folder)]
+    program = "import typer; from training.cli import register; app = typer.Typer(); register(app); app()"
+    environment = {**os.environ, "PYTHONPATH": str(repository)}
+
+    def start():
+        return subprocess.Popen(
+            [sys.executable, "-c", program, *words, "--jobs", "1"],
+            env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+        )  # fmt: skip
+
+    first = start()
+    while not list(folder.glob("cells/*/run/checkpoint.pt")) and first.poll() is None:
+        time.sleep(0.05)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.communicate()
+    checkpoint = next(folder.glob("cells/*/run/checkpoint.pt"))
+    import torch
+
+    reached = torch.load(checkpoint, weights_only=True)["step"]
+    assert 0 < reached <= 1200
+    events = len(list(folder.glob("cells/*/run/figures/*")))
+    output, _ = (second := start()).communicate()
+    assert second.returncode == 0, output
+    (one,) = read_results(folder)
+    assert one.steps == 1200
+    assert len(list(folder.glob("cells/*/run/figures/*"))) >= events

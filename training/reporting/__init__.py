@@ -1,0 +1,1 @@
+"""The tables and figure panels of the MorphoFlow paper, for any sweep."""

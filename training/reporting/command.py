@@ -1,0 +1,67 @@
+"""The command report."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from model.errors import CohortError, InvalidParameter
+from training.cohorts.sources import open_cohort
+from training.console import exit_status, progress
+
+if TYPE_CHECKING:
+    from training.reporting.page import Chapter
+
+PANELS = 5
+
+
+def report(
+    sweeps: Annotated[list[Path], typer.Argument(help="Folders of sweeps, one a cohort.")],
+    output: Annotated[Path, typer.Option(help="HTML file; a CSV file of the same name is written beside it.")],
+    title: Annotated[str, typer.Option(help="Heading of the page.")] = "MorphoFlow: tables and panels",
+    pictures: Annotated[
+        bool, typer.Option("--pictures/--no-pictures", help="Whether panels may show shapes of every cohort.")
+    ] = True,
+    published_only: Annotated[
+        bool,
+        typer.Option("--published-only", help="Show shapes of those cohorts alone whose licence lets weights ship."),
+    ] = False,
+    command: Annotated[list[str] | None, typer.Option(help="A line on how the sweeps were made; may repeat.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Write the result as JSON.")] = False,
+) -> None:
+    """Write the paper's tables and figure panels of sweeps as one HTML file and as CSV."""
+    with exit_status():
+        from training.reporting.page import page
+        from training.reporting.tables import write_table
+
+        with progress(PANELS * len(sweeps), "drawing panels") as bar:
+            chapters = [
+                _chapter(folder, pictures, published_only, lambda name: bar.advance(bar.task_ids[0]))
+                for folder in sweeps
+            ]
+        output.parent.mkdir(parents=True, exist_ok=True)
+        output.write_text(page(title, chapters, command or ()), encoding="utf-8")
+        table = output.with_suffix(".csv")
+        write_table([line for chapter in chapters for line in chapter.lines], table)
+        summary = {"page": str(output), "table": str(table), "cohorts": [chapter.cohort for chapter in chapters]}
+        typer.echo(json.dumps(summary) if as_json else f"{output} and {table} written")
+
+
+def _chapter(folder: Path, pictures: bool, published_only: bool, watch: Callable[[str], None]) -> "Chapter":
+    from training.reporting.chapters import chapter_of
+    from training.sweep.record import read_record
+    from training.sweep.table import read_results
+
+    results = read_results(folder)
+    if not results:
+        raise InvalidParameter("The sweep has no finished cell; one with results is accepted.", part="sweeps")
+    shown = pictures and (not published_only or all(result.shippable for result in results))
+    cohort = None
+    if shown:
+        try:
+            cohort = open_cohort(*read_record(folder))
+        except CohortError as error:
+            typer.echo(f"{folder.name}: panels of shapes are left out: {error}", err=True)
+    return chapter_of(folder, results, cohort, pictures=shown, watch=watch)

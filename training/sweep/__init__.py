@@ -1,0 +1,1 @@
+"""Many small trainings beside each other, measured into one table of results."""

@@ -1,0 +1,128 @@
+"""The command sweep."""
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from model.bundle import read_manifest
+from model.errors import InvalidParameter
+from training.choices import DeviceName, ObjectiveName, RegimeName
+from training.cohort_options import takes_cohort
+from training.cohorts import CohortOptions
+from training.cohorts.sources import CohortSource, open_cohort
+from training.console import BAD_INPUT_STATUS, FAULT_STATUS, exit_status, progress, tell_findings
+from training.sweep.priors import PriorName
+
+if TYPE_CHECKING:
+    from training.sweep.workers import Sweep
+
+LATENT_SIZES = [16, 32, 64, 128, 256]
+REGIMES = [RegimeName.THIN, RegimeName.THICK, RegimeName.ORTHOGONAL]
+PRIORS = [PriorName.PLAIN, PriorName.FLOW_ARD]
+#: Seconds between two looks at the workers.
+LOOK_S = 0.5
+
+
+@takes_cohort
+def sweep(
+    source: CohortSource,
+    options: CohortOptions,
+    output: Annotated[Path, typer.Option(help="Folder of the table and the cells; a sweep in it goes on.")],
+    latent_size: Annotated[list[int] | None, typer.Option(min=1, max=1024, help="May repeat; 16 to 256.")] = None,
+    regime: Annotated[list[RegimeName] | None, typer.Option(help="May repeat; thin, thick and orthogonal.")] = None,
+    prior: Annotated[list[PriorName] | None, typer.Option(help="May repeat; plain and flow-ard.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds from --seed on.")] = 1,
+    objective: Annotated[ObjectiveName, typer.Option(help="What is minimised.")] = ObjectiveName.VARIATIONAL,
+    steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps of each cell.")] = None,
+    patience: Annotated[
+        int, typer.Option(min=0, help="End after so many validations without a better figure; 0 never does.")
+    ] = 5,
+    calibrate: Annotated[bool, typer.Option("--calibrate/--no-calibrate", help="Calibrate each cell.")] = True,
+    samples: Annotated[int, typer.Option(min=0, help="Generated shapes of each cell.")] = 1500,
+    limit: Annotated[int | None, typer.Option(min=1, help="Measure only so many cases.")] = None,
+    bundle: Annotated[
+        list[Path] | None, typer.Option(help="An exported model as a cell of its own; may repeat.")
+    ] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; one a CPU core when left out.")] = None,
+    device: Annotated[DeviceName, typer.Option(help="Where to compute.")] = DeviceName.AUTO,
+    as_json: Annotated[bool, typer.Option("--json", help="Write the result as JSON.")] = False,
+) -> None:
+    """Train and measure many models side by side, cell by cell; what is there is skipped."""
+    with exit_status():
+        from training.sweep.cell import Effort, adopt
+        from training.sweep.plan import cell_of, cells_of
+        from training.sweep.record import write_record
+        from training.sweep.workers import Sweep, cell_folder
+
+        found = open_cohort(source, options)
+        tell_findings(found)
+        if not found.test:
+            raise InvalidParameter(
+                "The cohort has no test shapes; one with a test split, or --test-fraction, is accepted.", part="cohort"
+            )
+        write_record(output, source, options)
+        given = {cell_of(read_manifest(path)[0]): path for path in bundle or ()}
+        for cell, path in given.items():
+            adopt(path, cell_folder(output, cell))
+        sizes, regimes, priors = latent_size or LATENT_SIZES, regime or REGIMES, prior or PRIORS
+        asked = (
+            []
+            if bundle and not (latent_size or regime or prior)
+            else cells_of(
+                sizes,
+                [one.value for one in regimes],
+                priors,
+                range(options.seed, options.seed + seeds),
+                objective.value,
+            )
+        )
+        cells = tuple(dict.fromkeys([*given, *asked]))
+        effort = Effort(steps, patience, calibrate, samples, limit)
+        _run(Sweep(source, options, cells, output, effort, device), jobs, as_json=as_json)
+
+
+def _run(plan: "Sweep", jobs: int | None, *, as_json: bool) -> None:
+    from training.sweep.summary import CSV, write_csv
+    from training.sweep.table import read_results
+    from training.sweep.workers import refusals, unfinished, work
+
+    plan.folder.mkdir(parents=True, exist_ok=True)
+    if "LOCAL_RANK" in os.environ or jobs == 1:
+        with progress(1, f"{len(unfinished(plan))} cells") as bar:
+            task = bar.task_ids[0]
+            work(plan, lambda words, done, total: bar.update(task, description=words, completed=done, total=total))
+    else:
+        _watch_workers(plan, jobs or len(os.sched_getaffinity(0)))
+    results = read_results(plan.folder) if (plan.folder / "results.jsonl").is_file() else []
+    write_csv(results, plan.folder / CSV)
+    _tell(plan, refusals(plan), len(unfinished(plan)), as_json=as_json)
+
+
+def _watch_workers(plan: "Sweep", jobs: int) -> None:
+    from training.sweep.workers import start_workers, unfinished
+
+    total = len(plan.cells)
+    workers = start_workers(plan, min(jobs, max(len(unfinished(plan)), 1)))
+    try:
+        with progress(total, "cells") as bar:
+            while any(worker.is_alive() for worker in workers):
+                bar.update(bar.task_ids[0], completed=total - len(unfinished(plan)))
+                time.sleep(LOOK_S)
+    finally:
+        for worker in workers:
+            worker.terminate()
+
+
+def _tell(plan: "Sweep", refused: dict[str, str], left: int, *, as_json: bool) -> None:
+    for key, words in refused.items():
+        typer.echo(f"left out {key}: {words}", err=True)
+    summary = {"sweep": str(plan.folder), "cells": len(plan.cells), "unfinished": left, "refused": refused}
+    typer.echo(
+        json.dumps(summary) if as_json else f"{len(plan.cells) - left} of {len(plan.cells)} cells in {plan.folder}"
+    )
+    if left:
+        raise typer.Exit(BAD_INPUT_STATUS if refused else FAULT_STATUS)

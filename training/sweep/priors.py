@@ -1,0 +1,22 @@
+"""Which parts of the prior a cell has."""
+
+from enum import StrEnum
+
+
+class PriorName(StrEnum):
+    """Which parts of the prior a cell has."""
+
+    FLOW_ARD = "flow-ard"
+    FLOW = "flow"
+    ARD = "ard"
+    PLAIN = "plain"
+
+    @property
+    def flow(self) -> bool:
+        """Whether there is a flow."""
+        return self in (PriorName.FLOW_ARD, PriorName.FLOW)
+
+    @property
+    def ard(self) -> bool:
+        """Whether relevance is determined."""
+        return self in (PriorName.FLOW_ARD, PriorName.ARD)

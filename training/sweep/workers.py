@@ -1,0 +1,111 @@
+"""Processes that share a sweep's folder: each takes the next cell that nobody holds.
+
+A cell is held by a lock on a file in its folder, which the system lets go when a process dies, so that a killed
+sweep leaves nothing to clean. On the CPU each process computes with one thread; on one GPU several share it;
+`torchrun` starts one for each GPU, and these need no other word between them than the folder.
+"""
+
+import fcntl
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+from model.errors import MorphoFlowError
+from training.choices import DeviceName
+from training.cohorts.assemble import CohortOptions
+from training.cohorts.cohort import Cohort
+from training.cohorts.sources import CohortSource, open_cohort
+from training.sweep.cell import Effort, Watch, run_cell
+from training.sweep.plan import Cell
+from training.sweep.table import append, done
+
+CELLS, REFUSED = "cells", "refused.txt"
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What all workers are told.
+
+    Attributes:
+        cells: in the order in which they are taken.
+        folder: of the table and of the cells.
+    """
+
+    source: CohortSource
+    options: CohortOptions
+    cells: tuple[Cell, ...]
+    folder: Path
+    effort: Effort
+    device: DeviceName
+
+
+def cell_folder(sweep_folder: Path, cell: Cell) -> Path:
+    """Where a cell's run and bundle lie."""
+    return sweep_folder / CELLS / cell.key
+
+
+def start_workers(sweep: Sweep, jobs: int) -> list[BaseProcess]:
+    """Start processes of one thread; they end when no cell is left."""
+    os.environ.update(OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
+    context = multiprocessing.get_context("spawn")
+    workers = [context.Process(target=work, args=(sweep,), daemon=True) for _ in range(jobs)]
+    for worker in workers:
+        worker.start()
+    return workers
+
+
+def work(sweep: Sweep, watch: Watch = lambda words, done, total: None) -> None:
+    """Take cells until none is left that is neither done nor held by another process."""
+    import torch
+
+    torch.set_num_threads(1)
+    if torch.cuda.is_available() and "LOCAL_RANK" in os.environ:
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
+    cohorts: dict[int, Cohort] = {}
+    for cell in sweep.cells:
+        folder = cell_folder(sweep.folder, cell)
+        with held(folder) as mine:
+            if mine and cell.key not in done(sweep.folder):
+                _attempt(sweep, cell, folder, cohorts, watch)
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[bool]:
+    """Whether this process holds the cell while the block runs."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+            return
+        yield True
+
+
+def refusals(sweep: Sweep) -> dict[str, str]:
+    """Cells that could not be brought to a result, and why."""
+    paths = {cell.key: cell_folder(sweep.folder, cell) / REFUSED for cell in sweep.cells}
+    return {key: path.read_text(encoding="utf-8") for key, path in paths.items() if path.is_file()}
+
+
+def _attempt(sweep: Sweep, cell: Cell, folder: Path, cohorts: dict[int, Cohort], watch: Watch) -> None:
+    refused = folder / REFUSED
+    refused.unlink(missing_ok=True)
+    try:
+        if cell.seed not in cohorts:
+            cohorts[cell.seed] = open_cohort(sweep.source, replace(sweep.options, seed=cell.seed))
+        known = sweep.source.cohort is not None
+        result = run_cell(cell, cohorts[cell.seed], folder, sweep.effort, sweep.device, known=known, watch=watch)
+        append(sweep.folder, result)
+    except MorphoFlowError as error:
+        refused.write_text(str(error), encoding="utf-8")
+
+
+def unfinished(sweep: Sweep) -> Sequence[Cell]:
+    """Cells without a result."""
+    there = done(sweep.folder)
+    return [cell for cell in sweep.cells if cell.key not in there]
