@@ -28,7 +28,7 @@ def main(
         return
     typer.echo()
     regimes = [RegimeName.THIN, RegimeName.THICK, RegimeName.ORTHOGONAL]
-    cli.evaluate(model, cohort=cohort, data=data, regime=regimes, limit=cases)
+    cli.evaluate(model=model, cohort=cohort, data=data, regime=regimes, limit=cases)
 
 
 if __name__ == "__main__":

@@ -37,18 +37,19 @@ def takes_cohort(command: Command) -> Command:
     """The command with these options in place of its parameters ``source`` and ``options``."""
     asked = inspect.signature(_chosen).parameters
     own = [one for name, one in inspect.signature(command).parameters.items() if name not in ("source", "options")]
-
-    def call(**values: Any) -> None:
-        chosen = {name: values.pop(name) for name in asked}
-        source, options = _chosen(**chosen)
-        command(source=source, options=options, **values)
-
     hints = get_type_hints(command, include_extras=True) | get_type_hints(_chosen, include_extras=True)
-    parameters = [*own, *asked.values()]
-    call.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [one.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[one.name]) for one in parameters]
-    )
-    call.__annotations__ = {one.name: hints[one.name] for one in parameters}
+    parameters = [one.replace(annotation=hints[one.name]) for one in (*own, *asked.values())]
+    signature = inspect.Signature(parameters)
+
+    def call(*args: Any, **values: Any) -> None:
+        bound = signature.bind(*args, **values)
+        bound.apply_defaults()
+        given = bound.arguments
+        source, options = _chosen(**{name: given.pop(name) for name in asked})
+        command(source=source, options=options, **given)
+
+    call.__signature__ = signature  # type: ignore[attr-defined]
+    call.__annotations__ = {one.name: one.annotation for one in parameters}
     call.__name__, call.__doc__ = command.__name__, command.__doc__
     return call
 

@@ -13,6 +13,7 @@ from service.routes.responses import DIRECT_FORMATS, MESH_MEDIA_TYPES
 from service.schemas import ReconstructionForm, ResultSummary
 from service.settings import SETTINGS_FILE_VARIABLE, Settings
 from tests.contract.test_openapi import operations
+from training.cli import register
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,19 @@ def test_commands_and_their_options_stand_in_the_docs(page):
         for parameter in command.params:
             for option in (word for word in parameter.opts if word.startswith("--")):
                 assert f"{option}`" in page or f"{option} " in page
+
+
+def test_training_commands_and_their_options_stand_in_the_docs(repository):
+    app = typer.Typer()
+    register(app)
+    pages = [repository / "docs" / "training.md", repository / "benchmarks" / "README.md"]
+    text = "".join(path.read_text(encoding="utf-8") for path in pages)
+    for name, command in typer.main.get_command(app).commands.items():
+        assert f"morphoflow {name}" in text
+        if name in ("sweep", "report"):
+            for parameter in command.params:
+                for option in (word for word in parameter.opts if word.startswith("--")):
+                    assert f"{option}`" in text or f"{option} " in text
 
 
 def test_problems_stand_in_the_docs_with_their_status(page):

@@ -94,8 +94,8 @@ class TestTrain:
     @pytest.mark.parametrize(
         ("words", "sentence"),
         [
-            ((), "--cohort or --masks"),
-            (("--cohort", "talus", "--masks", "."), "--cohort or --masks"),
+            ((), "exactly one is accepted"),
+            (("--cohort", "talus", "--masks", "."), "exactly one is accepted"),
             (("--cohort", "talus", "--data", "nowhere"), "data folder does not exist"),
             (("--masks", "nowhere"), "folder of masks does not exist"),
             (("--masks", ".", "--shippable"), "--shippable goes with --cohort"),
