@@ -105,13 +105,15 @@ def calibrate(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda pr
     return Calibration({candidate: Score(*np.mean(values, axis=0).tolist()) for candidate, values in totals.items()})
 
 
-def calibrate_bundle(folder: Path, cohort: Cohort, watch: Watch = lambda precision: None) -> Calibration:
+def calibrate_bundle(
+    folder: Path, cohort: Cohort, watch: Watch = lambda precision: None, *, threads: int | None = None
+) -> Calibration:
     """Calibrate a bundle on a cohort's validation cases and record the result in its manifest.
 
     Raises:
         BundleError: the bundle cannot be trusted.
     """
-    model = open_bundle(folder)
+    model = open_bundle(folder, threads=threads)
     found = calibrate(model, cohort.validation, watch)
     facts: dict[str, object] = {
         "cohort": cohort.name,

@@ -40,7 +40,7 @@ def read_arrays(path: Path, name: str, *, spacing_mm: float = 1.0, splits: Mappi
     try:
         with np.load(path) as archive:
             arrays = {key: np.asarray(archive[key]) for key in splits if key in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, AttributeError, TypeError, zipfile.BadZipFile) as error:
         raise CohortError("The MedMNIST file cannot be read; a complete NPZ archive is accepted.") from error
     if "train_images" not in arrays:
         raise CohortError("The archive holds no array train_images; a file of MedMNIST 3D is accepted.")

@@ -60,7 +60,8 @@ def _facts(results: Sequence[Result]) -> list[str]:
 def _paired(results: Sequence[Result]) -> list[str]:
     found = []
     for line in lines_of(results):
-        mine = [one for one in results if (one.regime, one.latent_size) == (line.trained, line.latent_size)]
+        wanted = (line.trained, line.latent_size, line.objective)
+        mine = [one for one in results if (one.regime, one.latent_size, one.objective) == wanted]
         asd = paired_difference(mine, "asd_mm", line.measured)
         if asd is not None:
             found.append(

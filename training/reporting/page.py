@@ -78,11 +78,11 @@ def _table(lines: Sequence[Line]) -> str:
     paper = any(line.paper for line in lines)
     span = (2 if paper else 1) * len(COLUMNS)
     top = _row(
-        _head("", "name") * 3
+        _head("", "name") * 4
         + "".join(_head(words, "edge", span + 1) for _, words in SIDES)
         + _head("", "edge", 2 * (1 + paper))
     )
-    names = "".join(_head(words, "name") for words in ("trained on", "measured in", "D"))
+    names = "".join(_head(words, "name") for words in ("trained on", "measured in", "objective", "D"))
     side = _head("n", "edge") + "".join(_head(title) + (_head("paper", "paper") if paper else "") for title in TITLES)
     tail = "".join(
         _head(words, "edge" if not place else "") + (_head("paper", "paper") if paper else "")
@@ -94,7 +94,8 @@ def _table(lines: Sequence[Line]) -> str:
 
 
 def _line(line: Line, *, paper: bool) -> str:
-    cells = [_cell(line.trained, "name"), _cell(line.measured, "name"), _cell(str(line.latent_size), "name")]
+    names = (line.trained, line.measured, line.objective, str(line.latent_size))
+    cells = [_cell(words, "name") for words in names]
     for prior, _ in SIDES:
         cells.append(_cell(str(line.cases.get(prior, "")), "edge"))
         for place, name in enumerate(COLUMNS):

@@ -60,6 +60,8 @@ def _reconstruction(
     drawing = for_evaluation(case.mask, case.grid, regime)
     options = Options(annotated=drawing.planes, uncertainty="none", resolution_mm=_step(model))
     mesh = reconstruct(model, [drawing.stack], options).mesh
+    if mesh.is_empty:
+        return
     surface = Surface(mesh.vertices, np.asarray(mesh.faces, np.int64))
     error = surface_error(case, surface)
     scale = Normalize(0.0, max(SCALE * float(error.mean()), 1e-3))

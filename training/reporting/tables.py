@@ -21,6 +21,7 @@ class Line:
 
     Attributes:
         trained, measured: regime of the drawings.
+        objective: what was minimised.
         figures: by prior and column, mean and SD over cases (and seeds); no entry where no cell was run.
         cases: by prior, how many measurements those are.
         active, correlation: with flow and ARD: counts for 95, 97 and 99 %, and R^2 and r.
@@ -31,6 +32,7 @@ class Line:
     trained: str
     measured: str
     latent_size: int
+    objective: str
     figures: dict[PriorName, dict[str, tuple[float, float]]]
     cases: dict[PriorName, int]
     active: tuple[int, ...]
@@ -40,14 +42,15 @@ class Line:
 
 def lines_of(results: Sequence[Result]) -> list[Line]:
     """Rows by cohort, regime of training, of measurement, and latent size."""
-    keys = sorted(
-        {
-            (one.cohort, _rank(one.regime), _rank(name), one.latent_size, one.regime, name)
-            for one in results
-            for name in one.measured
-        }
-    )
-    return [_line(results, cohort, trained, measured, size) for cohort, _, _, size, trained, measured in keys]
+    keys = {
+        (one.cohort, one.objective, _rank(one.regime), _rank(name), one.latent_size, one.regime, name)
+        for one in results
+        for name in one.measured
+    }
+    found = [
+        _line([one for one in results if (one.cohort, one.objective) == key[:2]], *key[4:]) for key in sorted(keys)
+    ]
+    return [line for line in found if line.figures]
 
 
 def paired_difference(results: Sequence[Result], column: str, regime: str) -> tuple[float, float, int] | None:
@@ -75,8 +78,9 @@ def write_table(lines: Sequence[Line], path: Path) -> None:
         writer.writerows(rows)
 
 
-def _line(results: Sequence[Result], cohort: str, trained: str, measured: str, size: int) -> Line:
-    mine = [one for one in results if (one.cohort, one.regime, one.latent_size) == (cohort, trained, size)]
+def _line(results: Sequence[Result], size: int, trained: str, measured: str) -> Line:
+    mine = [one for one in results if (one.regime, one.latent_size) == (trained, size)]
+    cohort, objective = mine[0].cohort, mine[0].objective
     figures: dict[PriorName, dict[str, tuple[float, float]]] = {}
     cases: dict[PriorName, int] = {}
     for prior, _ in SIDES:
@@ -98,6 +102,7 @@ def _line(results: Sequence[Result], cohort: str, trained: str, measured: str, s
         trained,
         measured,
         size,
+        objective,
         figures,
         cases,
         tuple(full.active) if full is not None else (),
@@ -108,8 +113,8 @@ def _line(results: Sequence[Result], cohort: str, trained: str, measured: str, s
 
 def _flat(line: Line) -> Iterator[tuple[str, object]]:
     yield from zip(
-        ("cohort", "trained_on", "measured_in", "latent_size"),
-        (line.cohort, line.trained, line.measured, line.latent_size),
+        ("cohort", "trained_on", "measured_in", "latent_size", "objective"),
+        (line.cohort, line.trained, line.measured, line.latent_size, line.objective),
         strict=True,
     )
     for prior, _ in SIDES:

@@ -159,7 +159,7 @@ def _export(run: Path, bundle: Path, cohort: Cohort, effort: Effort) -> None:
     shutil.rmtree(part, ignore_errors=True)
     export_run(run, part)
     if effort.calibrate and cohort.validation:
-        calibrate_bundle(part, cohort)
+        calibrate_bundle(part, cohort, threads=1)
     part.rename(bundle)
 
 

@@ -20,7 +20,8 @@ class Result:
         key: of the cell; the fields after it are the cell's.
         cohort, source, licence: of the shapes.
         shippable: whether weights, and so pictures, of these shapes may be published.
-        steps: optimiser steps that were run, over `seconds`.
+        steps: optimiser steps that were asked for; fewer are run where early stopping ends them.
+        seconds: of the last attempt at the cell.
         sigmas: of the base, largest first.
         active: dimensions for 95, 97 and 99 % of the base variance.
         latent, surface_mm: of the generated shapes, see `training.generation`.

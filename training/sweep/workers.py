@@ -52,10 +52,20 @@ def start_workers(sweep: Sweep, jobs: int) -> list[BaseProcess]:
     """Start processes of one thread; they end when no cell is left."""
     os.environ.update(OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
     context = multiprocessing.get_context("spawn")
-    workers = [context.Process(target=work, args=(sweep,), daemon=True) for _ in range(jobs)]
+    workers = [context.Process(target=work_for, args=(sweep, os.getpid()), daemon=True) for _ in range(jobs)]
     for worker in workers:
         worker.start()
     return workers
+
+
+def work_for(sweep: Sweep, parent: int) -> None:
+    """Work as long as the process that asked for it lives: when that one is killed, no orphan goes on."""
+
+    def watch(words: str, done: int, total: int) -> None:
+        if os.getppid() != parent:
+            raise SystemExit(f"the sweep's process ended while {words} stood at {done} of {total}")
+
+    work(sweep, watch)
 
 
 def work(sweep: Sweep, watch: Watch = lambda words, done, total: None) -> None:
