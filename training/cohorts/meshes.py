@@ -78,7 +78,7 @@ def read_mesh(path: Path, how: Voxelising) -> MaskFile:
         InvalidMask: a surface that is not closed, or one of a size that anatomy in mm has not.
     """
     surface = closed_surface(path)
-    return voxelised(surface, how)
+    return voxelised(surface, how, stem(path))
 
 
 def closed_surface(path: Path) -> Any:
@@ -110,8 +110,11 @@ def closed_surface(path: Path) -> Any:
     return surface
 
 
-def voxelised(surface: Any, how: Voxelising) -> MaskFile:
+def voxelised(surface: Any, how: Voxelising, name: str) -> MaskFile:
     """Voxels whose centres lie inside a closed surface.
+
+    Args:
+        name: of the mesh, for errors.
 
     Raises:
         InvalidMask: an extent that anatomy in mm has not, or more than `MOST_VOXELS`.
@@ -121,13 +124,13 @@ def voxelised(surface: Any, how: Voxelising) -> MaskFile:
     low, high = EXTENT_RANGE_MM
     if not low <= extent <= high:
         raise InvalidMask(
-            f"the mesh is {extent:.3g} mm long; coordinates in mm, {low:g} to {high:g} long, are accepted"
+            f"the mesh is {extent:.3g} mm long; coordinates in mm, {low:g} to {high:g} long, are accepted", part=name
         )
     # Half a step off round numbers, so that no centre lies on a face of a mesh that was made of voxels.
     lower = np.floor((bounds[:, 0] - MARGIN_MM) / how.spacing_mm) * how.spacing_mm + 0.5 * how.spacing_mm
     shape = np.ceil((bounds[:, 1] + MARGIN_MM - lower) / how.spacing_mm).astype(int) + 1
     if shape.astype(float).prod() > MOST_VOXELS:
-        raise InvalidMask(f"the mesh would have over {MOST_VOXELS} voxels; a larger spacing is accepted")
+        raise InvalidMask(f"the mesh would have over {MOST_VOXELS} voxels; a larger spacing is accepted", part=name)
     mask = _stencil(surface, lower, shape, how.spacing_mm)
     affine = np.diag([how.spacing_mm] * 3 + [1.0])
     affine[:3, 3] = lower

@@ -149,7 +149,7 @@ class TestDecathlon:
 
 class TestMedMnist:
     def test_splits_are_those_of_the_file(self, tmp_path):
-        images = np.stack([ball(5.0 + 0.1 * n) for n in range(8)]).astype(np.uint8)
+        images = np.stack([ball(5.0 + 0.3 * n) for n in range(8)]).astype(np.uint8)
         np.savez(
             tmp_path / "vesselmnist3d.npz", train_images=images[:5], val_images=images[5:7], test_images=images[7:]
         )
@@ -179,7 +179,7 @@ class TestVerse:
         middles = {}
         for n in range(count):
             middle = np.array([12.0, 9.0 + 16 * n, 9.0])
-            labels[(((index - middle) / [1.4, 1.0, 1.2]) ** 2).sum(axis=-1) <= radius**2] = top - n
+            labels[(((index - middle) / [1.2 + 0.08 * n, 1.0, 1.2]) ** 2).sum(axis=-1) <= radius**2] = top - n
             middles[top - n] = middle
         return labels, middles
 
@@ -270,7 +270,7 @@ class TestOaiZib:
     def test_the_femoral_bone_is_cut_out_and_knees_of_one_person_stay_together(self, tmp_path):
         for n in range(5):
             self.write(tmp_path, f"90011{n:02d}", 5.0 + 0.2 * n)
-        self.write(tmp_path, "9001100", 5.1, suffix="_V01.mhd")
+        self.write(tmp_path, "9001100", 6.1, suffix="_V01.mhd")
         self.write(tmp_path, "9001107", 6.4, suffix=".nii.gz")
         found = opened(CohortOptions(), masks=tmp_path, layout=LayoutName.OAI_ZIB)
         everything = {case.name: case for case in found.cases}
