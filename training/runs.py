@@ -115,8 +115,10 @@ def _check_folder(folder: Path, wanted: dict[str, Any], *, resume: bool) -> None
         raise InvalidParameter(
             "The output folder holds a run already; an empty folder, or --resume, is accepted.", part="output"
         )
-    _, there = read_record(folder)
-    if there != json.loads(json.dumps(wanted)):
+    config, there = read_record(folder)
+    # A field that the configuration did not have then counts with its default.
+    known = {**there, "config": json.loads(json.dumps(config.as_dict()))}
+    if known != json.loads(json.dumps(wanted)):
         raise InvalidParameter(
             "The run in the output folder was made of other masks or settings; the same ones are accepted.",
             part="resume",
