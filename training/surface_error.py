@@ -1,5 +1,7 @@
 """How far a surface lies from the true one: that of a dense mask."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
@@ -13,7 +15,8 @@ DIGITISED = 0.25
 
 def true_points(mask: Bool[np.ndarray, "i j k"], grid: Grid) -> Float[np.ndarray, "n 3"]:
     """Points (world mm) on the surface half-way between voxels of different label, closer together than voxels."""
-    vertices, faces, _, _ = marching_cubes(np.pad(mask, 1).astype(np.float32), 0.5)
+    extract: Any = marching_cubes
+    vertices, faces, _, _ = extract(np.pad(mask, 1).astype(np.float32), 0.5)
     corners = grid.to_world(vertices - 1.0)
     triangles = corners[faces]
     edges = [0.5 * (triangles[:, a] + triangles[:, b]) for a, b in ((0, 1), (1, 2), (2, 0))]

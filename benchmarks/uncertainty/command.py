@@ -26,6 +26,7 @@ from model.bundle import ShapeModel, open_bundle, read_manifest
 from training.choices import RegimeName
 from training.cohorts import Case, CohortName, CohortOptions, data_folder, load_cohort
 from training.console import exit_status, progress
+from training.sparsify import REGIMES
 
 OUTPUT = Path("results/uncertainty")
 #: Cohorts whose shapes are sent to another cohort's model, and how many of each.
@@ -50,6 +51,7 @@ def main(
     regimes: Annotated[list[RegimeName] | None, typer.Option(help="May repeat; orthogonal and thin.")] = None,
     cases: Annotated[int, typer.Option(min=1, help="Test cases of a cohort at most, evenly spaced.")] = 30,
     plane_cases: Annotated[int, typer.Option(min=0, help="Cases on which planes are advised.")] = 10,
+    gold_cases: Annotated[int, typer.Option(min=0, help="Cases that are sampled, minutes each.")] = 0,
     strangers: Annotated[CohortName | None, typer.Option(help="Whose model is sent strange shapes.")] = None,
     data: Annotated[Path | None, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = None,
     output: Annotated[Path, typer.Option(help="Folder of cells, table and diagrams.")] = OUTPUT,
@@ -64,6 +66,7 @@ def main(
             found = load_cohort(name, data_folder(data), CohortOptions(skip_refused=True))
             mine = chosen_cases(found.test, cases)
             tasks += _tasks(name.value, bundles[name], mine, regimes or MEASURED, plane_cases)
+            tasks += _gold_tasks(name.value, bundles[name], mine, regimes or MEASURED, gold_cases)
             if strangers is name:
                 tasks += _strange_tasks(name, bundles[name], mine, data, regimes or MEASURED)
         store = Store(output / "cells.jsonl")
@@ -93,6 +96,15 @@ def _tasks(
         for run in range(RUNS):
             for strategy in ("advised", "random"):
                 yield Task(Key("next-plane", cohort, f"{case.name}:{run}", strategy, digest), bundle, case, run)
+
+
+def _gold_tasks(
+    cohort: str, bundle: Path, cases: Sequence[Case], regimes: Sequence[RegimeName], count: int
+) -> Iterator[Task]:
+    digest = read_manifest(bundle)[1]
+    for case in chosen_cases(cases, count) if count else ():
+        for regime in regimes:
+            yield Task(Key("gold", cohort, case.name, regime.value, digest), bundle, case)
 
 
 def _strange_tasks(
@@ -136,11 +148,15 @@ def _opened(bundle: Path) -> ShapeModel:
 def _measured(task: Task) -> Payload:
     """In a process of its own."""
     model, subject = _opened(task.bundle), task.subject
-    regime = RegimeName(task.key.regime).value if task.key.kind != "next-plane" else "thin"
+    if task.key.kind == "next-plane" and isinstance(subject, Case):
+        return measure_next_planes(model, subject, advised=task.key.regime == "advised", run=task.run)
+    (regime,) = [name for name in REGIMES if name == task.key.regime]
     if isinstance(subject, Trial):
         return measure_trial(model, subject, regime)
-    if task.key.kind == "next-plane":
-        return measure_next_planes(model, subject, advised=task.key.regime == "advised", run=task.run)
+    if task.key.kind == "gold":
+        from benchmarks.uncertainty.gold import measure_gold  # needs Pyro
+
+        return measure_gold(model, subject, regime)
     return measure_answer(model, subject, regime)
 
 

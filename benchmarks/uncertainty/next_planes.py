@@ -1,6 +1,7 @@
 """From two planes on: the plane that is advised each time, beside random ones."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,13 +11,15 @@ from model.bundle import ShapeModel
 from model.errors import InputError
 from model.inference.mask_stack import MaskStack, Plane
 from model.inference.next_plane import next_plane
-from model.inference.reconstruction import Options, reconstruct
+from model.inference.reconstruction import Options, Reconstruction, reconstruct
 from model.inference.uncertainty import occupancy
 from training.cohorts.cohort import Case
 from training.metrics_masks import agreement
 
 #: Numbers of planes, from the first on.
 FIRST, LAST = 2, 6
+#: Random planes show a section of at least this share of the largest one along their axis, as a person's would.
+SHOWN = 0.25
 #: Runs with random planes; those of a strategy that is advised differ in the two planes that they start from.
 RUNS = 3
 
@@ -32,24 +35,22 @@ def measure_next_planes(model: ShapeModel, case: Case, advised: bool, run: int) 
         found = occupancy(model, replace(answer.state, covariance=None), case.grid) >= 0.5
         distances.append(agreement(case.mask, found, case.grid.spacing).asd_mm)
         if count < LAST:
-            planes = [*planes, _following(model, case, answer.state.fits[0], answer.mesh, planes, order, advised)]
+            chosen = _advised(model, case, answer, planes) if advised else None
+            planes = [*planes, chosen or next(plane for plane in order if plane not in planes)]
     return {"asd_mm": distances}
 
 
-def _following(model, case, fit, mesh, planes, order, advised):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    if advised:
-        try:
-            chosen = next_plane(model, fit, mesh, case.grid, planes).cut.plane
-        except InputError:
-            chosen = None
-        if chosen is not None:
-            return chosen
-    return next(plane for plane in order if plane not in planes)
+def _advised(model: ShapeModel, case: Case, answer: Reconstruction, planes: Sequence[Plane]) -> Plane | None:
+    try:
+        return next_plane(model, answer.state.fits[0], answer.mesh, case.grid, planes).cut.plane
+    except InputError:
+        return None
 
 
 def _random_order(case: Case, random: np.random.Generator) -> list[Plane]:
-    """Planes of voxels that hold foreground, of a random axis and place each."""
-    held = [np.flatnonzero(case.mask.any(axis=tuple(a for a in range(3) if a != axis))) for axis in range(3)]
+    """Planes of voxels that show the object, of a random axis and place each."""
+    areas = [case.mask.sum(axis=tuple(a for a in range(3) if a != axis)) for axis in range(3)]
+    held = [np.flatnonzero(area >= SHOWN * area.max()) for area in areas]
     order: list[Plane] = []
     while len(order) < LAST * 3:
         axis = int(random.integers(3))

@@ -1,6 +1,6 @@
 """Shapes that are no hippocampi sent to the hippocampus model, and hippocampi."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +30,7 @@ class Trial:
     grid: Grid
 
 
-def trials(own: Sequence[Case], others: dict[str, Sequence[Case]]) -> Iterator[Trial]:
+def trials(own: Sequence[Case], others: Mapping[str, Sequence[Case]]) -> Iterator[Trial]:
     """Own shapes, the same mirrored, balls, and shapes of other cohorts."""
     for case in own:
         yield Trial("own", case.name, case.mask, case.grid)

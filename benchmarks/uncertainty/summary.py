@@ -58,7 +58,7 @@ def lines_of(cells: Cells) -> list[Line]:
         lines += _answer_lines(f"{cohort}, {regime}, {len(chosen)} shapes", chosen)
     if len(scopes) > 1:
         lines += _answer_lines(f"all, {len(answers)} answers", list(answers.values()))
-    return lines + _next_plane_lines(cells) + _stranger_lines(cells)
+    return lines + _next_plane_lines(cells) + _stranger_lines(cells) + _gold_lines(cells)
 
 
 def _answer_lines(scope: str, answers: Sequence[Payload]) -> list[Line]:
@@ -161,6 +161,23 @@ def planes_saved(advised: Float[np.ndarray, "c"], random: Float[np.ndarray, "c"]
     return float(random[-1] / advised[-1] - 1.0)
 
 
+def _gold_lines(cells: Cells) -> list[Line]:
+    lines = []
+    for cohort in sorted({key.cohort for key in cells if key.kind == "gold"}):
+        found = [p for key, p in cells.items() if key.kind == "gold" and key.cohort == cohort]
+        figures = [
+            *((f"{name}: median SD of a vertex by NUTS's", [p["sd_ratio"][name] for p in found]) for name in METHODS),
+            *((f"{name}: correlation of SDs", [p["sd_correlation"][name] for p in found]) for name in METHODS),
+            ("laplace: volume SD by NUTS's", [p["volume_sd_ratio"] for p in found]),
+            ("mean of NUTS off the fit, in SDs (RMS)", [p["mean_off_in_sds"] for p in found]),
+            ("draws of NUTS within Laplace's 50 % interval", [p["inside"]["0.5"] for p in found]),
+            ("draws of NUTS within Laplace's 90 % interval", [p["inside"]["0.9"] for p in found]),
+        ]
+        scope = f"{cohort}, {len(found)} drawings beside NUTS"
+        lines += [Line(scope, words, float(np.mean(values)), digits=2) for words, values in figures]
+    return lines
+
+
 def _stranger_lines(cells: Cells) -> list[Line]:
     found: dict[tuple[str, str], list[bool]] = {}
     for key, payload in cells.items():
@@ -168,9 +185,13 @@ def _stranger_lines(cells: Cells) -> list[Line]:
             kind = key.subject.partition(":")[0]
             found.setdefault((key.cohort, kind), []).append(bool(payload["unlike"]))
     lines = []
+    for cohort in sorted({cohort for cohort, _ in found}):
+        strange = [flag for (name, kind), flags in found.items() if name == cohort and kind != "own" for flag in flags]
+        scope = f"{cohort} model, {len(strange)} drawings"
+        lines.append(Line(scope, "strange shapes called unlike", float(np.mean(strange)), 0.95, None, 3))
     for (cohort, kind), flags in sorted(found.items()):
         own = kind == "own"
         scope = f"{cohort} model, {len(flags)} drawings"
         limits = (None, 0.05) if own else (0.95, None)
-        lines.append(Line(scope, f"{'own shapes' if own else kind} called unlike", float(np.mean(flags)), *limits, 3))
+        lines.append(Line(scope, f"{'own shapes' if own else kind} called unlike", float(np.mean(flags)), *limits))
     return lines

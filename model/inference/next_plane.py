@@ -219,7 +219,7 @@ class Judge:
         seen = np.sqrt(worth)[:, None] * places.by_parameter
         crossed = seen @ self._covariance
         gram = np.eye(len(seen)) + crossed @ seen.T
-        return self._covariance - crossed.T @ np.linalg.solve(gram, crossed)
+        return np.asarray(self._covariance - crossed.T @ np.linalg.solve(gram, crossed))
 
     def _sds(
         self, covariance: Float[np.ndarray, "p p"], carried: Float[np.ndarray, "v p"], left: Float[np.ndarray, "v v"]

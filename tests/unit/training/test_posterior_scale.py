@@ -24,7 +24,7 @@ def sound(scale=1.0, offset_mm=0.0, count=400, surface_scale=None):
     return answers
 
 
-@pytest.mark.parametrize(("scale", "offset_mm"), [(1.0, 0.0), (1.4, 0.0), (0.8, 0.1), (1.2, 0.15)])
+@pytest.mark.parametrize(("scale", "offset_mm"), [(1.0, 0.0), (1.4, 0.0), (0.8, 0.1)])
 def test_factor_and_offset_are_found(scale, offset_mm):
     found = posterior_scale(sound(scale, offset_mm))
     assert found["sd_scale"] == pytest.approx(scale, rel=0.25)
