@@ -99,6 +99,7 @@ def running_orthanc(
     folder: Path, ports: tuple[int, int], service_dicom_port: int, service_http_port: int, forward: str = BY_DIMSE
 ) -> Iterator[Orthanc]:
     """The archive while the context lasts; what it keeps stays in the folder."""
+    folder = folder.resolve()  # Orthanc takes paths for relative to the file of its settings
     folder.mkdir(parents=True, exist_ok=True)
     script = folder / "forward.lua"
     script.write_text(FORWARD % forward)
