@@ -11,6 +11,7 @@ import json
 import os
 import platform
 import time
+import traceback
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import partial
@@ -22,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.load import faults, jobs, kills, memory, replicas, requests
-from benchmarks.load.figures import Figure
+from benchmarks.load.figures import Figure, say
 from benchmarks.pacs import scene, storm
 from benchmarks.pacs.orthanc import BY_DICOMWEB, BY_DIMSE
 
@@ -55,10 +56,10 @@ def run_all(
     found = json.loads(output.read_text()) if output.exists() else {}
     for name in names:
         if name not in found:
-            found[name] = measured(name, chosen[name])
+            found |= measured(name, chosen[name])
             output.parent.mkdir(parents=True, exist_ok=True)
             output.write_text(json.dumps(found, indent=1))
-    if not shown({name: found[name] for name in names}):
+    if not shown({name: found[name] for name in names if name in found}) or not found.keys() >= set(names):
         raise typer.Exit(1)
 
 
@@ -84,19 +85,23 @@ def measurements(*, quick: bool, postgres: str) -> Mapping[str, Measure]:
     return found
 
 
-def measured(name: str, measure: Measure) -> dict[str, Any]:
-    """One measurement as a record."""
+def measured(name: str, measure: Measure) -> dict[str, dict[str, Any]]:
+    """One measurement as a record by its name; nothing when it broke off, so that the next run tries it again."""
     typer.echo(f"-- {name}, begun {datetime.now(UTC):%H:%M:%S}")
     began = time.monotonic()
-    figures = measure()
-    for figure in figures:
-        typer.echo(figure.line())
-    return {
+    try:
+        figures = measure()
+    except (Exception, SystemExit):
+        typer.echo(f"{name} broke off:\n{traceback.format_exc()}", err=True)
+        return {}
+    say(figures)
+    record = {
         "when": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "seconds": round(time.monotonic() - began, 1),
         "figures": [figure.record() for figure in figures],
     }
+    return {name: record}
 
 
 def shown(found: Mapping[str, Mapping[str, Any]]) -> bool:

@@ -40,17 +40,17 @@ class Figure:
 
 def at_most(name: str, value: float, limit: float, unit: str = "", digits: int = 2) -> Figure:
     """A figure that has to stay below a limit."""
-    return Figure(name, f"{value:.{digits}f}{unit}", f"below {limit:g}{unit}", value < limit)
+    return Figure(name, f"{value:.{digits}f}{unit}", f"below {limit:g}{unit}", bool(value < limit))
 
 
 def at_least(name: str, value: float, limit: float, unit: str = "", digits: int = 2) -> Figure:
     """A figure that has to come up to a limit."""
-    return Figure(name, f"{value:.{digits}f}{unit}", f"{limit:g}{unit} or more", value >= limit)
+    return Figure(name, f"{value:.{digits}f}{unit}", f"{limit:g}{unit} or more", bool(value >= limit))
 
 
 def holds(name: str, value: str, target: str, *, reached: bool) -> Figure:
     """Something that is so or is not."""
-    return Figure(name, value, target, reached)
+    return Figure(name, value, target, bool(reached))
 
 
 def told(name: str, value: str) -> Figure:
