@@ -91,7 +91,7 @@ def measured(name: str, measure: Measure) -> dict[str, dict[str, Any]]:
     began = time.monotonic()
     try:
         figures = measure()
-    except (Exception, SystemExit):
+    except (Exception, SystemExit):  # noqa: BLE001 - the others are to be measured all the same
         typer.echo(f"{name} broke off:\n{traceback.format_exc()}", err=True)
         return {}
     say(figures)
