@@ -97,14 +97,20 @@ def export(
     output: Annotated[Path, typer.Option(help="Folder of the bundle; created.")],
     name: Annotated[str | None, typer.Option(help="Name of the model; the cohort's when left out.")] = None,
     version: Annotated[str, typer.Option(help="Version of the model.")] = "1",
+    prune: Annotated[bool, typer.Option("--prune", help="Only the dimensions that ARD kept alive.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Export a run as a bundle that the service loads."""
     with exit_status():
         from training.release import export_run
 
-        manifest = export_run(run, output, name=name, version=version)
-        summary = {"bundle": str(output), "name": manifest.name, "version": manifest.version}
+        manifest = export_run(run, output, name=name, version=version, prune=prune)
+        summary = {
+            "bundle": str(output),
+            "name": manifest.name,
+            "version": manifest.version,
+            "dimensions": manifest.latent_size,
+        }
         typer.echo(json.dumps(summary) if as_json else f"{manifest.name} {manifest.version} written to {output}")
 
 

@@ -15,8 +15,10 @@ from jaxtyping import Float
 from model.bundle import POPULATION, Manifest, write_manifest
 from model.errors import InvalidParameter
 from model.networks.export import export_graphs
+from model.networks.prior import LatentPrior
 from training.autodecoder import AutoDecoder
 from training.config import TrainingConfig
+from training.pruning import pruned
 from training.runs import CHECKPOINT, read_record
 
 #: Shares of the base variance for which active dimensions are counted (MorphoFlow paper).
@@ -35,8 +37,9 @@ def export_run(
     version: str = "1",
     likelihood_precision: float = UNCALIBRATED_PRECISION,
     accuracy: Mapping[str, Mapping[str, float]] | None = None,
+    prune: bool = False,
 ) -> Manifest:
-    """Write the bundle of a finished run.
+    """Write the bundle of a finished run, of its live dimensions alone with `prune` (`training.pruning`).
 
     Raises:
         InvalidParameter: the folder holds no finished run, or the output holds something already.
@@ -47,10 +50,12 @@ def export_run(
     if output.exists() and any(output.iterdir()):
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
     output.mkdir(parents=True, exist_ok=True)
+    less = pruned(module) if prune else None
+    decoder, prior = (module.decoder, module.prior) if less is None else (less.decoder, less.prior)
     with _quiet_exporter():
-        files = export_graphs(module.decoder, module.prior, output)
-    write_population(module, record, output / POPULATION)
-    sigmas = module.prior.sigma.detach().cpu().numpy().astype(float)
+        files = export_graphs(decoder, prior, output)
+    write_population(prior, module.code_means() if less is None else less.codes, record, output / POPULATION)
+    sigmas = prior.sigma.detach().cpu().numpy().astype(float)
     manifest = Manifest(
         name=name or record["cohort"],
         version=version,
@@ -58,14 +63,14 @@ def export_run(
         frame="RAS",
         units="mm",
         side=record["side"],
-        latent_size=config.decoder.latent_size,
+        latent_size=len(sigmas),
         sigmas=tuple(sigmas.tolist()),
         active_dimensions=active_dimensions(sigmas),
         half_extent_mm=(record["half_extent_mm"][0], record["half_extent_mm"][1], record["half_extent_mm"][2]),
         resolution_mm=RESOLUTION_MM,
         likelihood_precision=likelihood_precision,
         calibration={},
-        training=training_facts(config, record),
+        training={**training_facts(config, record), **({} if less is None else {"pruned": less.facts()})},
         licence=record["licence"],
         attribution=record["attribution"],
         accuracy={regime: dict(figures) for regime, figures in (accuracy or {}).items()},
@@ -109,12 +114,13 @@ def load_module(run: Path, config: TrainingConfig, shapes: int) -> AutoDecoder:
     return module.eval()
 
 
-def write_population(module: AutoDecoder, record: Mapping[str, Any], path: Path) -> None:
+def write_population(
+    prior: LatentPrior, codes: Float[torch.Tensor, "m d"], record: Mapping[str, Any], path: Path
+) -> None:
     """Codes, base codes, log densities (nats) and volumes (mL) of the training shapes."""
     with torch.no_grad():
-        codes = module.code_means()
-        base, _ = module.prior.to_base(codes)
-        density = module.prior.log_density(codes)
+        base, _ = prior.to_base(codes)
+        density = prior.log_density(codes)
     np.savez(
         path,
         codes=_array(codes),

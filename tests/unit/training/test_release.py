@@ -52,6 +52,16 @@ def released(run):
 
 @pytest.mark.slow
 class TestExport:
+    def test_a_pruned_bundle_holds_the_live_dimensions_alone(self, run, tmp_path):
+        manifest = export_run(run, tmp_path / "pruned", prune=True)
+        facts = manifest.training["pruned"]
+        opened = open_bundle(tmp_path / "pruned", threads=1)
+        assert manifest.latent_size == len(manifest.sigmas) == len(facts["live"]) <= facts["dimensions_before"] == 3
+        assert opened.population.codes.shape == opened.population.base_codes.shape == (4, manifest.latent_size)
+        codes = opened.population.codes
+        np.testing.assert_allclose(opened.prior.to_base(codes), opened.population.base_codes, atol=1e-5)
+        assert opened.decoder.logits(codes, np.zeros((4, 1, 3))).shape == (4, 1)
+
     def test_the_manifest_is_the_one_that_was_written(self, released):
         manifest, output = released
         opened = open_bundle(output, threads=1)

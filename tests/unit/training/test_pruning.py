@@ -1,0 +1,123 @@
+"""Pruning: the field and the base of live dimensions are those of the whole networks with dead ones at their mean."""
+
+import numpy as np
+import pytest
+import torch
+
+from model.errors import InvalidParameter
+from model.networks.decoder import DecoderShape
+from model.networks.flow import FlowShape
+from model.networks.prior import PriorShape
+from tests.random_networks import randomise
+from training.autodecoder import AutoDecoder
+from training.config import ObjectiveConfig, TrainingConfig
+from training.pruning import LEAST_NATS, divergences, pruned
+
+SIZE, SHAPES = 6, 20
+LIVE = [0, 2, 3, 5]
+
+
+def module_of(*, transforms=1, objective="variational", live=LIVE, seed=0):
+    """A random module whose codes say nothing along the other dimensions."""
+    torch.manual_seed(seed)
+    config = TrainingConfig(
+        decoder=DecoderShape(latent_size=SIZE, width=16, depth=3),
+        prior=PriorShape(FlowShape(latent_size=SIZE, transforms=transforms, bins=3, width=12)),
+        objective=ObjectiveConfig(name=objective),
+    )
+    module = AutoDecoder(config, SHAPES)
+    randomise(module.prior.flow, seed, 0.4)
+    with torch.no_grad():
+        module.prior.log_sigma.copy_(torch.linspace(-1.0, 0.5, SIZE))
+        module.mean.normal_()
+        module.log_deviation.fill_(-2.0 if objective == "variational" else -3.0)
+        dead = [number for number in range(SIZE) if number not in live]
+        module.mean[:, dead] = 1e-3
+        module.log_deviation[:, dead] = 0.0
+    return module.eval()
+
+
+def filled(less, codes, centre):
+    """Live codes among dead dimensions at their mean."""
+    whole = centre.expand(len(codes), -1).clone()
+    whole[:, torch.from_numpy(less.live)] = codes
+    return whole
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("seed", range(3))
+def test_the_field_is_that_of_the_whole_decoder_with_dead_dimensions_at_their_mean(seed):
+    module = module_of(seed=seed)
+    less = pruned(module)
+    assert less.live.tolist() == LIVE
+    codes, points = torch.randn(4, len(LIVE)), 20.0 * torch.randn(4, 30, 3)
+    whole = module.decoder(filled(less, codes, module.code_means().mean(dim=0)), points)
+    torch.testing.assert_close(less.decoder(codes, points), whole, atol=1e-5, rtol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("seed", range(3))
+def test_one_transform_keeps_base_and_density_of_live_dimensions(seed):
+    """With dead dimensions at their mean the whole density is the pruned one plus that of the dead, a conditional."""
+    module = module_of(seed=seed)
+    less = pruned(module)
+    codes = 0.5 * torch.randn(5, len(LIVE))
+    whole = filled(less, codes, module.code_means().mean(dim=0))
+    kept = torch.from_numpy(less.live)
+    torch.testing.assert_close(
+        less.prior.to_base(codes)[0], module.prior.to_base(whole)[0][:, kept], atol=1e-5, rtol=1e-5
+    )
+    jacobian = module.prior.base_jacobian(whole)[1][:, kept][:, :, kept]
+    torch.testing.assert_close(less.prior.base_jacobian(codes)[1], jacobian, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(less.prior.from_base(less.prior.to_base(codes)[0]), codes, atol=1e-4, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_the_density_integrates_to_one_over_the_live_dimensions():
+    module = module_of(transforms=2, live=[1])
+    less = pruned(module)
+    places = torch.linspace(-20.0, 20.0, 40001)[:, None]
+    total = float(less.prior.log_density(places).exp().sum() * (places[1] - places[0]))
+    assert total == pytest.approx(1.0, abs=1e-3)
+
+
+@torch.no_grad()
+def test_what_two_transforms_change_is_measured():
+    module = module_of(transforms=2)
+    less = pruned(module)
+    kept = torch.from_numpy(less.live)
+    whole = module.prior.to_base(module.code_means())[0][:, kept] / module.prior.sigma[kept]
+    change = (less.prior.to_base(less.codes)[0] / less.prior.sigma - whole).abs().max()
+    assert less.base_change == pytest.approx(float(change), rel=1e-5)
+    assert less.facts()["largest_base_change_in_sigmas"] == less.base_change
+
+
+@torch.no_grad()
+def test_without_dead_dimensions_nothing_changes():
+    module = module_of(transforms=2, live=list(range(SIZE)))
+    less = pruned(module)
+    assert less.live.tolist() == list(range(SIZE))
+    assert less.base_change < 1e-5
+    codes = torch.randn(3, SIZE)
+    torch.testing.assert_close(less.prior.log_density(codes), module.prior.log_density(codes), atol=1e-4, rtol=1e-5)
+
+
+def test_divergences_are_those_of_gaussians():
+    module = module_of()
+    found = divergences(module)
+    mean = module.mean.detach().numpy()
+    expected = 0.5 * (np.exp(-4.0) + (mean**2).mean(axis=0) - 1.0) + 2.0
+    np.testing.assert_allclose(found[LIVE], expected[LIVE], rtol=1e-4)
+    np.testing.assert_allclose(found[[1, 4]], 0.0, atol=1e-5)
+    assert (found[[1, 4]] < LEAST_NATS).all()
+
+
+def test_points_are_judged_by_their_spread():
+    module = module_of(objective="paper")
+    assert pruned(module).live.tolist() == LIVE
+    assert np.isnan(pruned(module).nats).all()
+
+
+def test_a_run_of_which_nothing_is_alive_is_refused():
+    with pytest.raises(InvalidParameter, match="at least one live one"):
+        pruned(module_of(live=[]))

@@ -1,0 +1,144 @@
+"""A trained decoder and prior without the dimensions that ARD left unused.
+
+A dimension is dead when its codes say nothing: the divergence of the posterior from the prior along it, averaged over
+the training shapes, is below a threshold. What it adds at its mean goes into biases, so the field of the pruned decoder is
+that of the whole one with dead dimensions at their mean. The flow is autoregressive: dead dimensions enter conditioners
+of live ones as their mean too, transform after transform. Between transforms a dead dimension may follow live ones a
+little; `Pruned.base_change` measures what that alters.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from model.errors import InvalidParameter
+from model.networks.decoder import OccupancyDecoder
+from model.networks.flow import MaskedLinear, SplineTransform
+from model.networks.prior import LatentPrior
+from model.networks.splines import parameter_count
+from training.autodecoder import AutoDecoder
+
+#: A dimension whose divergence is below this (nats a training shape) is dead.
+LEAST_NATS = 0.02
+#: Where codes are points: one whose standard deviation is below this share of the largest.
+LEAST_SHARE = 0.02
+
+
+@dataclass(frozen=True)
+class Pruned:
+    """Networks over the live dimensions alone.
+
+    Attributes:
+        live: numbers of these dimensions in the whole code.
+        codes: (m, k) training codes.
+        nats: (d,) divergence of each dimension of the whole code; NaN where codes are points.
+        base_change: largest change of a live base coordinate of a training code, in sigmas.
+    """
+
+    decoder: OccupancyDecoder
+    prior: LatentPrior
+    live: Int[np.ndarray, "k"]
+    codes: Float[Tensor, "m k"]
+    nats: Float[np.ndarray, "d"]
+    base_change: float
+
+    def facts(self) -> dict[str, object]:
+        """What the manifest says of it."""
+        return {
+            "dimensions_before": len(self.nats),
+            "live": self.live.tolist(),
+            "rule": f"divergence of posterior from prior at least {LEAST_NATS:g} nats a shape"
+            if np.isfinite(self.nats).all()
+            else f"standard deviation of the codes at least {LEAST_SHARE:g} of the largest",
+            "nats": [None if np.isnan(value) else float(value) for value in self.nats],
+            "largest_base_change_in_sigmas": self.base_change,
+        }
+
+
+@torch.no_grad()
+def pruned(module: AutoDecoder) -> Pruned:
+    """Decoder and prior without dead dimensions.
+
+    Raises:
+        InvalidParameter: all dimensions are dead.
+    """
+    nats = divergences(module)
+    live = live_dimensions(module, nats)
+    if not live.any():
+        raise InvalidParameter("All dimensions are dead; a run with at least one live one is accepted.", part="prune")
+    kept, codes = torch.from_numpy(np.flatnonzero(live)), module.code_means()
+    centre = codes.mean(dim=0)
+    decoder = pruned_decoder(module.decoder, kept, centre)
+    prior = pruned_prior(module.prior, kept, centre)
+    whole = module.prior.to_base(codes)[0][:, kept] / module.prior.sigma[kept]
+    change = (prior.to_base(codes[:, kept])[0] / prior.sigma - whole).abs().max()
+    return Pruned(decoder.eval(), prior.eval(), kept.numpy(), codes[:, kept], nats, float(change))
+
+
+@torch.no_grad()
+def divergences(module: AutoDecoder) -> Float[np.ndarray, "d"]:
+    """Mean over the training shapes of ``KL(q_i || N(0, sigma_i^2))`` (nats); NaN where codes are points."""
+    codes, sigma = module.code_means(), module.prior.sigma
+    if not module.random:
+        return np.full(len(sigma), np.nan)
+    everyone = torch.arange(len(codes))
+    spread = (module.log_deviations(everyone) - module.prior.log_sigma).exp()
+    nats = 0.5 * (spread.square() + (codes / sigma).square() - 1.0) - spread.log()
+    return np.asarray(nats.mean(dim=0).numpy(), float)
+
+
+@torch.no_grad()
+def live_dimensions(module: AutoDecoder, nats: Float[np.ndarray, "d"]) -> Bool[np.ndarray, "d"]:
+    """Dimensions that say something about the training shapes."""
+    if module.random:
+        return np.asarray(nats >= LEAST_NATS)
+    deviation = module.code_means().std(dim=0).numpy()
+    return np.asarray(deviation >= LEAST_SHARE * deviation.max())
+
+
+@torch.no_grad()
+def pruned_decoder(decoder: OccupancyDecoder, live: Int[Tensor, "k"], centre: Float[Tensor, "d"]) -> OccupancyDecoder:
+    """The decoder over live dimensions; the others stand at their centre."""
+    result = OccupancyDecoder(replace(decoder.shape, latent_size=len(live)))
+    state = decoder.state_dict()
+    result.load_state_dict({**state, "from_latent": state["from_latent"][:, live]})
+    fixed = centre.clone()
+    fixed[live] = 0.0
+    for layer, weights in zip(result.from_point, decoder.latent_weights(), strict=True):
+        layer.bias.add_(weights @ fixed)
+    return result
+
+
+@torch.no_grad()
+def pruned_prior(prior: LatentPrior, live: Int[Tensor, "k"], centre: Float[Tensor, "d"]) -> LatentPrior:
+    """The prior over live dimensions; the others stand at their centre in every conditioner."""
+    shape = replace(prior.shape, flow=replace(prior.shape.flow, latent_size=len(live)))
+    result = LatentPrior(shape)
+    result.log_sigma.copy_(prior.log_sigma[live])
+    value = (centre / prior.flow_scale())[None]
+    for whole, part in zip(prior.flow.transforms, result.flow.transforms, strict=True):
+        _prune_transform(whole, part, live, value[0])
+        value, _ = whole(value)
+    return result
+
+
+def _prune_transform(
+    whole: SplineTransform, part: SplineTransform, live: Int[Tensor, "k"], value: Float[Tensor, "d"]
+) -> None:
+    fixed = value.clone()
+    fixed[live] = 0.0
+    size = parameter_count(whole.shape.bins)
+    rows = (live[:, None] * size + torch.arange(size)).reshape(-1)
+    _fill(part.first, whole.first.weight[:, live], whole.first.mask[:, live], whole.first.bias)
+    part.first.bias.add_(whole.first.masked() @ fixed)
+    _fill(part.second, whole.second.weight, whole.second.mask, whole.second.bias)
+    _fill(part.last, whole.last.weight[rows], whole.last.mask[rows], whole.last.bias[rows])
+
+
+def _fill(layer: MaskedLinear, weight: Tensor, mask: Tensor, bias: Tensor) -> None:
+    layer.weight.copy_(weight)
+    layer.mask.copy_(mask)
+    layer.bias.copy_(bias)
