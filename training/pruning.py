@@ -1,10 +1,10 @@
 """A trained decoder and prior without the dimensions that ARD left unused.
 
 A dimension is dead when its codes say nothing: the divergence of the posterior from the prior along it, averaged over
-the training shapes, is below a threshold. What it adds at its mean goes into biases, so the field of the pruned decoder is
-that of the whole one with dead dimensions at their mean. The flow is autoregressive: dead dimensions enter conditioners
-of live ones as their mean too, transform after transform. Between transforms a dead dimension may follow live ones a
-little; `Pruned.base_change` measures what that alters.
+the training shapes, is below a threshold. What it adds at its mean goes into biases, so the field of the pruned decoder
+is that of the whole one with dead dimensions at their mean. The flow is autoregressive: dead dimensions enter the
+conditioners of live ones as their mean too, transform after transform. Between transforms a dead dimension may follow
+live ones a little; `Pruned.base_change` measures what that alters.
 """
 
 from dataclasses import dataclass, replace
