@@ -118,19 +118,20 @@ class SamplingStepGraph(nn.Module):
 
 @dataclass(frozen=True)
 class GraphSpec:
-    """A graph to export: its module, named inputs and outputs, and the module that TorchScript traces."""
+    """A graph to export: its module, inputs and outputs by name, what TorchScript traces, and the latents' units."""
 
     name: str
     module: nn.Module
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     scripted: nn.Module | None
+    units: Tensor
 
     def example(self, latent_size: int, extent_mm: float, batch: int, points: int, seed: int) -> tuple[Tensor, ...]:
-        """Random inputs of the given sizes."""
+        """Random inputs of the given sizes; latents as far out as the prior draws them."""
         random = torch.Generator().manual_seed(seed)
         sizes = {name: (batch, points, 3) if name == "points" else (batch, latent_size) for name in self.inputs}
-        scales = {name: extent_mm if name == "points" else 1.0 for name in self.inputs}
+        scales = {name: extent_mm if name == "points" else self.units for name in self.inputs}
         return tuple(scales[n] * torch.randn(*sizes[n], generator=random).clamp(-2, 2) for n in self.inputs)
 
 
@@ -140,12 +141,15 @@ def graph_specs(decoder: OccupancyDecoder, prior: LatentPrior) -> list[GraphSpec
     transforms = prior.flow.transforms if prior.shape.use_flow else ()
     steps = [SamplingStepGraph(transform, prior.flow_scale()) for transform in transforms]
     where, derivatives = ("latent", "points"), ("logits", "by_latent", "by_point")
+    units = prior.sigma.detach()
     return [
-        GraphSpec("decoder_logits", logits, where, ("logits",), logits),
-        GraphSpec("decoder_jacobians", jacobians, where, derivatives, jacobians),
-        GraphSpec("prior_density", density, ("latent",), ("log_density", "gradient", "base"), ScriptedDensity(prior)),
-        GraphSpec("prior_base_jacobian", BaseJacobianGraph(prior), ("latent",), ("base", "jacobian"), None),
-        *(GraphSpec(f"prior_sampling_{k}", s, ("target", "guess"), ("next",), s) for k, s in enumerate(steps)),
+        GraphSpec("decoder_logits", logits, where, ("logits",), logits, units),
+        GraphSpec("decoder_jacobians", jacobians, where, derivatives, jacobians, units),
+        GraphSpec(
+            "prior_density", density, ("latent",), ("log_density", "gradient", "base"), ScriptedDensity(prior), units
+        ),
+        GraphSpec("prior_base_jacobian", BaseJacobianGraph(prior), ("latent",), ("base", "jacobian"), None, units),
+        *(GraphSpec(f"prior_sampling_{k}", s, ("target", "guess"), ("next",), s, units) for k, s in enumerate(steps)),
     ]
 
 
