@@ -77,9 +77,8 @@ class AutoDecoder(nn.Module):
         """The joint objective and its terms, means over the chosen shapes."""
         weights = self.config.objective
         codes = self.draw_codes(chosen, generator)
-        with torch.autocast("cuda", torch.bfloat16, enabled=codes.is_cuda):
-            logits = self.decoder(codes, batch.points)
-        rec = reconstruction_loss(weights.reconstruction, logits.float(), batch.labels, batch.weights).mean()
+        logits = self.decoder(codes, batch.points)
+        rec = reconstruction_loss(weights.reconstruction, logits, batch.labels, batch.weights).mean()
         density = -self.prior.log_density(codes)
         if self.random:
             density = density - gaussian_entropy(self.log_deviations(chosen))
