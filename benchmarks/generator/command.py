@@ -9,8 +9,8 @@ from benchmarks.generator.first_byte import first_byte_s
 from benchmarks.generator.measuring import Plan, measured
 from benchmarks.generator.table import Figure, markdown
 from training.choices import SplitName
-from training.cohorts import CohortName, CohortOptions
-from training.console import exit_status, open_cohort, progress
+from training.cohorts import CohortName, CohortOptions, data_folder, load_cohort
+from training.console import exit_status, progress
 from training.evaluate import find_bundle, open_named, shipped_bundles
 
 #: Parts of the measurement, the service's first byte among them.
@@ -35,7 +35,7 @@ def run(
     with exit_status(), progress(PARTS, f"measuring {model}") as bar:
         opened = open_named(model)
         options = CohortOptions(seed=seed, skip_refused=True)
-        found = open_cohort(cohort, None, data, options, labels=())
+        found = load_cohort(cohort, data_folder(data), options)
         plan = Plan(samples, compared, fitted, timed, spacing_mm, seed)
         figures: list[Figure] = []
         for part in measured(opened, found, found.of_split(split.value), plan):
