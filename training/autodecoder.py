@@ -125,6 +125,10 @@ class Trainer:
         self.step += 1
         return {name: value.item() for name, value in terms.items()} if read else {}
 
+    def at_end(self) -> bool:
+        """Whether the last step was made, or an earlier one was found to be the last."""
+        return self.finished or self.step >= self.config.steps
+
     def _schedule(self) -> None:
         progress = self.step / self.config.steps
         ramp = self.config.objective.ramp
@@ -140,7 +144,7 @@ class Trainer:
         state = {
             "config": self.config.as_dict(),
             "step": self.step,
-            "finished": self.finished or self.step == self.config.steps,
+            "finished": self.at_end(),
             "module": self.module.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
@@ -177,11 +181,10 @@ def _optimiser(module: AutoDecoder, config: TrainingConfig) -> torch.optim.Optim
 def train(trainer: Trainer, folder: Path, watch: Watch = lambda step, figures: None) -> AutoDecoder:
     """Run to the configured number of steps with checkpoints in ``folder/checkpoint.pt``."""
     folder.mkdir(parents=True, exist_ok=True)
-    while trainer.step < trainer.config.steps and not trainer.finished:
+    while not trainer.at_end():
         following = trainer.step + 1
         figures = trainer.advance(read=following % READ_EVERY == 0 or following == trainer.config.steps)
         watch(trainer.step, figures)
-        last = trainer.finished or trainer.step == trainer.config.steps
-        if last or trainer.step % trainer.config.checkpoint_every == 0:
+        if trainer.at_end() or trainer.step % trainer.config.checkpoint_every == 0:
             trainer.save(folder / "checkpoint.pt")
     return trainer.module

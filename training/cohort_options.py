@@ -8,7 +8,8 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from training.cohorts import CohortName, CohortOptions
-from training.cohorts.sources import CohortSource, LayoutName, SpaceName
+from training.cohorts.sources import CohortSource, LayoutName
+from training.cohorts.voxelising import SpaceName
 
 CohortOption = Annotated[CohortName | None, typer.Option("--cohort", help="A public cohort below the data folder.")]
 MasksOption = Annotated[Path | None, typer.Option("--masks", help="A folder of NIfTI, NRRD or MetaImage masks.")]

@@ -1,10 +1,11 @@
 """A trained decoder and prior without the dimensions that ARD left unused.
 
-A dimension is dead when its codes say nothing: the divergence of the posterior from the prior along it, averaged over
-the training shapes, is below a threshold. What it adds at its mean goes into biases, so the field of the pruned decoder
-is that of the whole one with dead dimensions at their mean. The flow is autoregressive: dead dimensions enter the
-conditioners of live ones as their mean too, transform after transform. Between transforms a dead dimension may follow
-live ones a little; `Pruned.base_change` measures what that alters.
+A dimension is dead when ARD left it next to no sigma, so that it moves no surface, or when its codes say nothing: the
+divergence of the posterior from the prior along it, averaged over the training shapes, is next to zero. What it adds
+at its mean goes into biases, so the field of the pruned decoder is that of the whole one with dead dimensions at their
+mean. The flow is autoregressive: dead dimensions enter the conditioners of live ones as their mean too, transform
+after transform. Between transforms a dead dimension may follow live ones a little; `Pruned.base_change` measures what
+that alters.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +24,7 @@ from training.autodecoder import AutoDecoder
 
 #: A dimension whose divergence is below this (nats a training shape) is dead.
 LEAST_NATS = 0.02
-#: Where codes are points: one whose standard deviation is below this share of the largest.
+#: So is one whose sigma, or standard deviation of the codes where these are points, is below this share of the largest.
 LEAST_SHARE = 0.02
 
 
@@ -50,7 +51,7 @@ class Pruned:
         return {
             "dimensions_before": len(self.nats),
             "live": self.live.tolist(),
-            "rule": f"divergence of posterior from prior at least {LEAST_NATS:g} nats a shape"
+            "rule": f"sigma at least {LEAST_SHARE:g} of the largest and divergence at least {LEAST_NATS:g} nats a shape"
             if np.isfinite(self.nats).all()
             else f"standard deviation of the codes at least {LEAST_SHARE:g} of the largest",
             "nats": [None if np.isnan(value) else float(value) for value in self.nats],
@@ -92,11 +93,10 @@ def divergences(module: AutoDecoder) -> Float[np.ndarray, "d"]:
 
 @torch.no_grad()
 def live_dimensions(module: AutoDecoder, nats: Float[np.ndarray, "d"]) -> Bool[np.ndarray, "d"]:
-    """Dimensions that say something about the training shapes."""
-    if module.random:
-        return np.asarray(nats >= LEAST_NATS)
-    deviation = module.code_means().std(dim=0).numpy()
-    return np.asarray(deviation >= LEAST_SHARE * deviation.max())
+    """Dimensions that say something about the training shapes and move their surfaces."""
+    scale = (module.prior.sigma if module.random else module.code_means().std(dim=0)).numpy()
+    wide = scale >= LEAST_SHARE * scale.max()
+    return np.asarray(wide & (nats >= LEAST_NATS) if module.random else wide)
 
 
 @torch.no_grad()

@@ -100,7 +100,7 @@ def sampled(posterior: Posterior, seed: int, warm_up: int = WARM_UP, draws: int 
     apply = _Potential.apply
 
     def potential(values: dict[str, torch.Tensor]) -> torch.Tensor:
-        answer: torch.Tensor = apply(values["q"], posterior)
+        answer: torch.Tensor = apply(values["q"], posterior)  # type: ignore[no-untyped-call]
         return answer
 
     kernel = NUTS(potential_fn=potential, max_tree_depth=DEEPEST, adapt_mass_matrix=False, target_accept_prob=0.8)

@@ -52,7 +52,9 @@ def start_workers(sweep: Sweep, jobs: int) -> list[BaseProcess]:
     """Start processes of one thread; they end when no cell is left."""
     os.environ.update(OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
     context = multiprocessing.get_context("spawn")
-    workers = [context.Process(target=work_for, args=(sweep, os.getpid()), daemon=True) for _ in range(jobs)]
+    workers: list[BaseProcess] = [
+        context.Process(target=work_for, args=(sweep, os.getpid()), daemon=True) for _ in range(jobs)
+    ]
     for worker in workers:
         worker.start()
     return workers
