@@ -18,7 +18,7 @@ from model.networks.export import export_graphs
 from model.networks.prior import LatentPrior
 from training.autodecoder import AutoDecoder
 from training.config import TrainingConfig
-from training.pruning import pruned
+from training.pruning import pruned, refitted
 from training.runs import CHECKPOINT, read_record
 
 #: Shares of the base variance for which active dimensions are counted (MorphoFlow paper).
@@ -50,7 +50,7 @@ def export_run(
     if output.exists() and any(output.iterdir()):
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
     output.mkdir(parents=True, exist_ok=True)
-    less = pruned(module) if prune else None
+    less = refitted(pruned(module), module, len(record["train"])) if prune else None
     decoder, prior = (module.decoder, module.prior) if less is None else (less.decoder, less.prior)
     with _quiet_exporter():
         files = export_graphs(decoder, prior, output)
