@@ -89,11 +89,13 @@ def _compactness(model: ShapeModel, active: tuple[int, int, int]) -> list[Figure
 
 def _distributions(model: ShapeModel, draws: Draws, training: Sequence[Surface]) -> list[Figure]:
     present = draws.present()
-    volumes = ks_2samp([s.volume_ml for s in present], model.population.volumes_ml)
+    volumes = ks_2samp([s.volume_ml for s in present], [s.volume_ml for s in training])
+    masks = ks_2samp([s.volume_ml for s in present], model.population.volumes_ml)
     areas = ks_2samp([s.area_cm2 for s in present], [s.area_cm2 for s in training])
     whole = sum(surface.parts == 1 for surface in present) / len(draws.surfaces)
     return [
-        Figure("volume: two-sample KS p", float(volumes.pvalue), "masks", limit=0.05, at_most=False),
+        Figure("volume: two-sample KS p", float(volumes.pvalue), "training codes' surfaces", limit=0.05, at_most=False),
+        Figure("volume: the same against the masks", float(masks.pvalue), "coarse surfaces are smaller"),
         Figure("area: two-sample KS p", float(areas.pvalue), "training codes' surfaces", limit=0.05, at_most=False),
         Figure("share of draws in one component", whole, limit=0.98, at_most=False),
     ]
