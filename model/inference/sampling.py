@@ -17,6 +17,8 @@ from model.inference.surface import require_spacing, surface_of
 HIGHEST_TEMPERATURE = 2.0
 #: A seed is drawn from at most so often; the last draw stands, plausible or not.
 MAX_DRAWS = 16
+#: Dimensions of a smaller sigma, against the largest, are dead: draws differ there from all training codes alike.
+LEAST_SIGMA = 0.01
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,8 @@ class SampledShape:
     Attributes:
         latent: (d,) latent code.
         log_density: of the latent code (nats).
-        nearest_training_distance: distance in z0, in units of sigma, to the nearest training code.
+        nearest_training_distance: distance in z0, in units of sigma, over live dimensions, to the nearest
+            training code.
         mesh: its surface; of several components the one of largest volume.
         rejected: draws of the same seed before this one that were implausible, by reason.
         plausible: whether this one is; None when it was not asked.
@@ -75,7 +78,8 @@ def draw_shape(
             break
         reasons.append(reason)
     rejected = counted({name: 1} for name in (reasons[:-1] if reason else reasons))
-    gap = np.linalg.norm((model.population.base_codes - base) / sigmas, axis=1)
+    live = sigmas >= LEAST_SIGMA * sigmas.max()
+    gap = np.linalg.norm(((model.population.base_codes - base) / sigmas)[:, live], axis=1)
     return SampledShape(
         latent=latent,
         log_density=float(model.prior.log_density(latent[None])[0][0]),

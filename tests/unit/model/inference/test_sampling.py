@@ -78,6 +78,14 @@ def test_a_training_code_lies_at_distance_zero():
     assert draw_shape(known, 5, spacing_mm=COARSE).nearest_training_distance == 0.0
 
 
+def test_dead_dimensions_put_no_distance_between_draws_and_training_codes():
+    dead = replace(MODEL, manifest=replace(MODEL.manifest, sigmas=(1.0, 1.0, 1e-4)))
+    flat = replace(dead, population=replace(dead.population, base_codes=MODEL.population.base_codes * [1, 1, 0]))
+    shape = draw_shape(flat, 8, spacing_mm=COARSE, reject=False)
+    expected = np.linalg.norm(MODEL.population.base_codes[:, :2] - shape.latent[:2], axis=1).min()
+    assert shape.nearest_training_distance == pytest.approx(expected)
+
+
 def test_spacing_is_that_of_the_surface():
     fine, coarse = (draw_shape(MODEL, 2, spacing_mm=spacing) for spacing in (0.8, 1.6))
     np.testing.assert_array_equal(fine.latent, coarse.latent)
