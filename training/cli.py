@@ -65,7 +65,7 @@ def train(
         bool | None,
         typer.Option(
             "--reflect/--no-reflect",
-            help="Whether mirror images join the training shapes; of public cohorts without a side they do.",
+            help="Whether mirror images join the training shapes; they do for structures without a side.",
         ),
     ] = None,
     patience: Annotated[

@@ -86,8 +86,11 @@ class Cohort:
 
     @property
     def reflects(self) -> bool:
-        """Whether the mirror image of a case belongs to the population as well."""
-        return self.side in ("mixed", "unpaired")
+        """Whether mirror images join the training shapes unless a caller says otherwise: where there are no sides.
+
+        Where there are two, mirror images would be a second heap of shapes, with the mean between both.
+        """
+        return self.side == "unpaired"
 
     @property
     def licence(self) -> str:
