@@ -31,7 +31,10 @@ function OnStoredInstance(id, tags, metadata, origin)
   end
 end
 """
-BY_DIMSE = "SendToModality(id, 'morphoflow')"
+#: As a job of its own, which can be asked for and repeated; SendToModality gathers all in one.
+BY_DIMSE = (
+    """RestApiPost('/modalities/morphoflow/store', '{"Resources":["' .. id .. '"],"Asynchronous":true}', false)"""
+)
 BY_DICOMWEB = """RestApiPost('/dicom-web/servers/morphoflow/stow', '{"Resources":["' .. id .. '"]}', false)"""
 
 
