@@ -104,7 +104,7 @@ def objection(mask: Bool[np.ndarray, "i j k"], centroid: Float[np.ndarray, "3"] 
     return "", False
 
 
-def cut_out(mask: Bool[np.ndarray, "i j k"], grid: Grid) -> tuple[Bool[np.ndarray, "i j k"], Grid]:
+def cut_out(mask: Bool[np.ndarray, "i j k"], grid: Grid) -> tuple[Bool[np.ndarray, "a b c"], Grid]:
     """A mask that is not empty, cropped with `MARGIN`, at its place in the world."""
     box = bounding_box(mask)
     start = np.array([max(side.start - MARGIN, 0) for side in box])
