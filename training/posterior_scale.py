@@ -28,6 +28,9 @@ LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9)
 #: Intervals of one drawing hold the truth together, so each counts as this share of an independent one.
 INDEPENDENT = 1.0 / len(LEVELS)
 
+#: Volume errors (mL), their SDs as they are (mL), and what the volumes gain when the surface moves out by 1 mm.
+Columns = tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
+
 
 def posterior_scale(sound: Sequence[Sound]) -> dict[str, float]:
     """`Manifest.posterior` of a model."""
@@ -37,7 +40,8 @@ def posterior_scale(sound: Sequence[Sound]) -> dict[str, float]:
     centre = float(np.log(np.clip(ratio, 0.25, 4.0)))
     logs = centre + np.linspace(-LOG_SCALE_REACH, LOG_SCALE_REACH, STEPS)
     offsets = np.linspace(0.0, HIGHEST_OFFSET_MM, STEPS)
-    costs = np.array([[_cost(sound, log, offset, centre) for offset in offsets] for log in logs])
+    columns = _columns(sound)
+    costs = np.array([[_cost(columns, log, offset, centre) for offset in offsets] for log in logs])
     row, column = np.unravel_index(int(np.argmin(costs)), costs.shape)
     return {
         "sd_scale": round(float(np.exp(logs[row])), 4),
@@ -48,15 +52,19 @@ def posterior_scale(sound: Sequence[Sound]) -> dict[str, float]:
 
 def coverage(sound: Sequence[Sound], scale: float, offset_mm: float, level: float) -> float:
     """Share of the answers whose interval of the volume holds the truth."""
-    error, sd, swelling = _columns(sound)
+    return _coverage(_columns(sound), scale, offset_mm, level)
+
+
+def _coverage(columns: Columns, scale: float, offset_mm: float, level: float) -> float:
+    error, sd, swelling = columns
     return float(np.mean(np.abs(error) <= interval_reach(level) * np.hypot(scale * sd, offset_mm * swelling)))
 
 
-def _cost(sound: Sequence[Sound], log_scale: float, offset_mm: float, centre: float) -> float:
+def _cost(columns: Columns, log_scale: float, offset_mm: float, centre: float) -> float:
     """Negative log posterior of the two numbers (nats)."""
-    data = sum(_deviance(coverage(sound, np.exp(log_scale), offset_mm, level), level) for level in LEVELS)
+    data = sum(_deviance(_coverage(columns, np.exp(log_scale), offset_mm, level), level) for level in LEVELS)
     prior = 0.5 * ((log_scale - centre) / LOG_SCALE_SD) ** 2 + 0.5 * (offset_mm / OFFSET_SD_MM) ** 2
-    return INDEPENDENT * len(sound) * data + prior
+    return INDEPENDENT * len(columns[0]) * data + prior
 
 
 def _deviance(share: float, level: float) -> float:
@@ -65,8 +73,6 @@ def _deviance(share: float, level: float) -> float:
     return float(sum(found * np.log(found / said) for found, said in terms if found > 0.0))
 
 
-def _columns(
-    sound: Sequence[Sound],
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+def _columns(sound: Sequence[Sound]) -> Columns:
     rows = np.array([[one.volume_error_ml, one.volume_sd_ml, one.swelling_ml] for one in sound])
     return rows[:, 0], rows[:, 1], rows[:, 2]

@@ -11,7 +11,7 @@ doubled because two were looked at.
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtr
 
 from model.bundle import ShapeModel
 from model.inference.agreement import Section
@@ -84,4 +84,4 @@ def predictive_warnings(
 
 
 def _tail(known: Mapping[str, float], z: float) -> float:
-    return float(student.sf(z, known["freedom"]))
+    return float(stdtr(known["freedom"], -z))

@@ -33,7 +33,7 @@ def test_factor_and_offset_are_found(scale, offset_mm):
 
 @pytest.mark.parametrize(("scale", "offset_mm"), [(1.3, 0.0), (1.0, 0.1)])
 def test_intervals_of_other_answers_hold_their_share(scale, offset_mm):
-    found = posterior_scale(sound(scale, offset_mm, 60))
+    found = posterior_scale(sound(scale, offset_mm, 300))
     for level, reach in ((0.9, 1.645), (0.5, 0.6745)):
         held = [
             abs(one.volume_error_ml)
