@@ -186,8 +186,8 @@ def _sample_to_folder(model: ShapeModel, seeds: range, how: Draw, target: Path, 
 def _make_all(model: ShapeModel, seeds: range, how: Draw, put: Callable[[SampleFile], Any], workers: int) -> bytes:
     writer, entries = SampleWriter(write_mesh, write_nifti), []
     with progress(len(seeds)) as step:
-        for file in in_order(partial(writer.make, model, how=how), seeds, workers):
-            step(file.name)
+        for seed, file in zip(seeds, in_order(partial(writer.make, model, how=how), seeds, workers), strict=True):
+            step(f"seed {seed}")
             put(file)
             entries.append(file.entry)
     return manifest_bytes(model, how, entries)

@@ -144,7 +144,7 @@ class Trainer:
         state = {
             "config": self.config.as_dict(),
             "step": self.step,
-            "finished": self.at_end(),
+            "finished": self.finished,
             "module": self.module.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),

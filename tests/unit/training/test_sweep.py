@@ -110,7 +110,7 @@ class TestTable:
 
     def test_rows_hold_means_over_what_was_measured(self, tmp_path):
         write_csv([result()], tmp_path / "table.csv")
-        (row,) = csv.DictReader((tmp_path / "table.csv").open())
+        (row,) = csv.DictReader((tmp_path / "table.csv").read_text(encoding="utf-8").splitlines())
         assert (float(row["asd_mm_mean"]), row["cases"], row["failed"]) == (0.5, "1", "1")
         assert float(row["pearson_r"]) == pytest.approx(1.0)
         assert list(row) == list(row_of(None, ""))
@@ -146,13 +146,14 @@ class TestRecord:
             write_record(tmp_path / "s", CohortSource(masks=tmp_path / "more"), CohortOptions())
 
 
-class TestSweep:
-    @pytest.fixture(scope="class")
-    def swept(self, masks, tmp_path_factory):
-        folder = tmp_path_factory.mktemp("sweep") / "out"
-        words = ("sweep", "--masks", masks, *QUICK, "--output", folder, "--jobs", 1, "--json")
-        return folder, words, call(*words)
+@pytest.fixture(scope="module")
+def swept(masks, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sweep") / "out"
+    words = ("sweep", "--masks", masks, *QUICK, "--output", folder, "--jobs", 1, "--json")
+    return folder, words, call(*words)
 
+
+class TestSweep:
     def test_the_table_has_a_line_for_each_cell(self, swept):
         folder, _, answer = swept
         assert answer.exit_code == 0, answer.output
