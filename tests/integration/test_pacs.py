@@ -9,6 +9,7 @@ import ssl
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -47,6 +48,15 @@ pytestmark = [
     pytest.mark.skipif(not is_installed(), reason="Orthanc is not installed (Debian: orthanc orthanc-dicomweb dcmtk)"),
 ]
 PATIENCE_S = 60.0
+
+
+@pytest.fixture(autouse=True, scope="module")
+def sockets_of_refused_peers():
+    """pynetdicom leaves the socket of a peer that was cut off to the garbage collector, which reports it anywhere."""
+    yield
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        gc.collect()
 
 
 @dataclass(frozen=True)

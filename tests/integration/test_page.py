@@ -227,8 +227,15 @@ def test_an_image_lies_under_the_drawing(visit, tmp_path):
 
 
 def gallery(visit):
+    """The pictures of the shapes, as soon as they stay as they are."""
     expect(visit.page.get_by_text("8 shapes.")).to_be_visible()
-    return [canvas.evaluate("c => c.toDataURL()") for canvas in visit.shown(".shapes canvas").all()]
+    found: list[str] = []
+    for _ in range(20):
+        before, found = found, [c.evaluate("c => c.toDataURL()") for c in visit.shown(".shapes canvas").all()]
+        if found == before and len(set(found)) == 8:
+            break
+        visit.page.wait_for_timeout(500)
+    return found
 
 
 def test_the_gallery_shows_the_same_shapes_when_it_is_loaded_again(visit):
