@@ -106,6 +106,11 @@ class Leases:
         with self._engine.connect() as connection:
             return int(connection.execute(query).scalar_one())
 
+    def lapse(self, executor: str) -> None:
+        """This executor is gone; the next that asks takes over what it may still hold."""
+        with self._engine.begin() as connection:
+            connection.execute(sa.update(_LEASES).where(_LEASES.c.executor == executor).values(seen_ms=0))
+
     def end(self, executor: str) -> None:
         """This executor is gone and holds nothing."""
         with self._engine.begin() as connection:

@@ -110,7 +110,7 @@ def running_worker(kinds: Sequence[JobKind], options: WorkerOptions, log: Log | 
         DBOS.destroy(destroy_registry=True)
         stop.set()
         keeper.join()
-        leases.end(options.executor)
+        leases.lapse(options.executor)  # a part that was taken from the queue in the meantime is the next worker's
         leases.close()
         jobs.close()
 
@@ -266,13 +266,13 @@ def _rarely(check: Check) -> Check:
 
 def _keep_lease(leases: Leases, options: WorkerOptions, stop: threading.Event) -> None:
     """Renew the own lease and take over what executors hold whose lease has run out."""
-    while not stop.wait(options.lease_s / 4):
-        try:
+    ended = False
+    while not ended:
+        with suppress(DBAPIError):  # the database is away; the next turn tries again
             leases.renew(options.executor)
             lost = [executor for executor in leases.lost(options.lease_s) if executor != options.executor]
             if lost:
                 DBOS._recover_pending_workflows(lost)
             for executor in lost:
                 leases.end(executor)
-        except DBAPIError:  # the database is away; the next turn tries again
-            continue
+        ended = stop.wait(options.lease_s / 4)
