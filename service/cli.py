@@ -105,8 +105,9 @@ def serve(
     given: dict[str, Any] = {"host": host, "port": port}
     settings = load_settings({name: value for name, value in given.items() if value is not None})
     require_protection(settings)
-    app = create_app(settings, registry=context.obj(settings))
-    typer.echo(f"Try it from another terminal:\n\n  {example_request(settings)}\n", err=True)
+    registry = context.obj(settings)
+    app = create_app(settings, registry=registry)
+    typer.echo(f"Try it from another terminal:\n\n  {example_request(settings, registry.names())}\n", err=True)
     with supervised_workers(settings.job_workers, app.state.services.log):
         uvicorn.run(
             app,
@@ -147,13 +148,14 @@ def interface_yaml() -> str:
     return yaml.safe_dump(interface_document(), sort_keys=False, allow_unicode=True, width=120)
 
 
-def example_request(settings: Settings) -> str:
-    """A request for the shell that works as it stands."""
+def example_request(settings: Settings, models: Sequence[str]) -> str:
+    """A request for the shell that works as it stands; the model is named where several are loaded."""
     host = "127.0.0.1" if settings.host in ("0.0.0.0", "::") else settings.host
     address = f"[{host}]" if ":" in host else host
     key = '-H "X-API-Key: $KEY" ' if settings.keys else ""
     url = f"http://{address}:{settings.port}{settings.root_path}/v1/reconstructions"
-    return f"curl {key}-H 'Accept: model/stl' -F mask=@mask.nii.gz -o surface.stl {url}"
+    model = f"-F model={models[0]} " if len(models) > 1 else ""
+    return f"curl {key}-H 'Accept: model/stl' {model}-F mask=@mask.nii.gz -o surface.stl {url}"
 
 
 def _program(context: typer.Context, version: VersionOption = False) -> None:

@@ -104,7 +104,7 @@ def begin_ensemble(client: httpx.Client) -> str:
     """Address of a new job that reconstructs with an ensemble."""
     files = {"mask": ("mask.nii.gz", MASK.read_bytes())}
     headers = {"Prefer": "respond-async"}
-    answer = client.post("/v1/reconstructions", files=files, data={"uncertainty": "ensemble"}, headers=headers)
+    answer = client.post("/v1/reconstructions", files=files, data={"model": "hippocampus", "uncertainty": "ensemble"}, headers=headers)
     return str(answer.raise_for_status().headers["location"])
 
 

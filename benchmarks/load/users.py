@@ -25,7 +25,7 @@ Prepared = tuple[bytes, dict[str, str]]
 def prepared(accept: str, **form: str) -> Prepared:
     """Body and headers of a request to reconstruct."""
     mask = ("mask.nii.gz", Path(os.environ["LOAD_MASK"]).read_bytes(), "application/gzip")
-    body, kind = encode_multipart_formdata({"mask": mask, **form})
+    body, kind = encode_multipart_formdata({"mask": mask, "model": "hippocampus", **form})
     return body, {"Content-Type": kind, "Accept": accept}
 
 

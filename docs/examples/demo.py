@@ -68,7 +68,8 @@ def wait_until_ready(client: httpx.Client, service: subprocess.Popen[bytes]) -> 
 def reconstruct(client: httpx.Client, mask: Path) -> dict[str, Any]:
     """Summary of the reconstruction from one mask."""
     with mask.open("rb") as content:
-        answer = client.post("/v1/reconstructions", files={"mask": (mask.name, content)})
+        files = {"mask": (mask.name, content)}
+        answer = client.post("/v1/reconstructions", files=files, data={"model": "hippocampus"})
     if answer.is_error:
         raise SystemExit(f"The service refused the mask: {answer.json().get('detail', answer.status_code)}")
     summary: dict[str, Any] = answer.json()

@@ -210,10 +210,15 @@ def test_serving_the_network_without_a_key_is_refused(capsys, monkeypatch):
     ],
 )
 def test_the_ready_request_names_the_address_and_no_key(changes, expected):
-    request = example_request(Settings(**changes))
+    request = example_request(Settings(**changes), ["bone"])
     assert expected in request
     assert "hush" not in request
     assert ("X-API-Key" in request) is ("api_keys" in changes)
+
+
+def test_the_ready_request_names_a_model_where_several_are_loaded():
+    assert "model=" not in example_request(Settings(), ["bone"])
+    assert " -F model=bone -F mask=" in example_request(Settings(), ["bone", "organ"])
 
 
 def test_the_interface_is_written_to_a_file(tmp_path):
