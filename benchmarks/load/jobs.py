@@ -103,8 +103,8 @@ def said(server: Server, event: str, place: str) -> float | None:
 def begin_ensemble(client: httpx.Client) -> str:
     """Address of a new job that reconstructs with an ensemble."""
     files = {"mask": ("mask.nii.gz", MASK.read_bytes())}
-    headers = {"Prefer": "respond-async"}
-    answer = client.post("/v1/reconstructions", files=files, data={"model": "hippocampus", "uncertainty": "ensemble"}, headers=headers)
+    form = {"model": "hippocampus", "uncertainty": "ensemble"}
+    answer = client.post("/v1/reconstructions", files=files, data=form, headers={"Prefer": "respond-async"})
     return str(answer.raise_for_status().headers["location"])
 
 
