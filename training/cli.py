@@ -98,13 +98,16 @@ def export(
     name: Annotated[str | None, typer.Option(help="Name of the model; the cohort's when left out.")] = None,
     version: Annotated[str, typer.Option(help="Version of the model.")] = "1",
     prune: Annotated[bool, typer.Option("--prune", help="Only the dimensions that ARD kept alive.")] = False,
+    anatomy: Annotated[
+        str | None, typer.Option(help="SNOMED CT code of the structure and its meaning, '67453005 Talus'.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Export a run as a bundle that the service loads."""
     with exit_status():
         from training.release import export_run
 
-        manifest = export_run(run, output, name=name, version=version, prune=prune)
+        manifest = export_run(run, output, name=name, version=version, prune=prune, anatomy=anatomy_code(anatomy))
         summary = {
             "bundle": str(output),
             "name": manifest.name,
@@ -112,6 +115,20 @@ def export(
             "dimensions": manifest.latent_size,
         }
         typer.echo(json.dumps(summary) if as_json else f"{manifest.name} {manifest.version} written to {output}")
+
+
+def anatomy_code(words: str | None) -> dict[str, str]:
+    """A SNOMED CT code and its meaning as they stand in a manifest.
+
+    Raises:
+        InvalidParameter: no code of 6 to 18 digits followed by its meaning.
+    """
+    if words is None:
+        return {}
+    value, _, meaning = words.strip().partition(" ")
+    if not (value.isdecimal() and 6 <= len(value) <= 18 and meaning.strip()):
+        raise InvalidParameter("A SNOMED CT code and its meaning are accepted, as '67453005 Talus'.", part="anatomy")
+    return {"value": value, "scheme": "SCT", "meaning": meaning.strip()}
 
 
 @takes_cohort

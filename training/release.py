@@ -38,8 +38,11 @@ def export_run(
     likelihood_precision: float = UNCALIBRATED_PRECISION,
     accuracy: Mapping[str, Mapping[str, float]] | None = None,
     prune: bool = False,
+    anatomy: Mapping[str, str] | None = None,
 ) -> Manifest:
     """Write the bundle of a finished run, of its live dimensions alone with `prune` (`training.pruning`).
+
+    `anatomy` is the code that results in DICOM carry (`model.bundle.Manifest.anatomy`).
 
     Raises:
         InvalidParameter: the folder holds no finished run, or the output holds something already.
@@ -74,6 +77,7 @@ def export_run(
         licence=record["licence"],
         attribution=record["attribution"],
         accuracy={regime: dict(figures) for regime, figures in (accuracy or {}).items()},
+        anatomy=dict(anatomy or {}),
         files={file: _digest(output / file) for file in sorted([*files, POPULATION])},
     )
     write_manifest(manifest, output)

@@ -50,7 +50,19 @@ def bundle(tmp_path_factory, run):
         write(folder / "masks", f"e{n}", ellipsoid(n))
     words = ("train", "--masks", folder / "masks", "--steps", 150, "--latent-size", 3, "--device", "cpu")
     assert run(*words, "--output", folder / "run").exit_code == 0
-    result = run("export", folder / "run", "--output", folder / "out", "--name", "egg", "--version", "2.1", "--json")
+    result = run(
+        "export",
+        folder / "run",
+        "--output",
+        folder / "out",
+        "--name",
+        "egg",
+        "--version",
+        "2.1",
+        "--anatomy",
+        "102298001 Egg",
+        "--json",
+    )
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["name"] == "egg"
     return folder / "out"
@@ -159,6 +171,7 @@ class TestExport:
         opened = open_bundle(bundle)
         manifest = opened.manifest
         assert (manifest.name, manifest.version, manifest.latent_size) == ("egg", "2.1", 3)
+        assert manifest.anatomy == {"value": "102298001", "scheme": "SCT", "meaning": "Egg"}
         assert manifest.training["shapes"] == len(opened.population.codes) == 5
         assert np.allclose(opened.population.volumes_ml, 4 / 3 * np.pi * 0.72, rtol=0.2)
         assert np.all(np.array(manifest.half_extent_mm) >= 8.0)
@@ -169,6 +182,12 @@ class TestExport:
         result = run("export", bundle.parent / "run", "--output", bundle)
         assert result.exit_code == 2
         assert "not empty" in result.stderr
+
+    @pytest.mark.parametrize("words", ["Talus", "67453005", "67453 Talus"])
+    def test_an_anatomy_without_code_or_meaning_is_refused(self, run, bundle, tmp_path, words):
+        result = run("export", bundle.parent / "run", "--output", tmp_path / "out", "--anatomy", words)
+        assert result.exit_code == 2
+        assert "67453005 Talus" in result.stderr
 
     def test_a_folder_without_a_run_is_refused(self, run, tmp_path):
         assert run("export", tmp_path, "--output", tmp_path / "out").exit_code == 2
