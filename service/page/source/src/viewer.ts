@@ -101,8 +101,11 @@ export class SurfaceView {
     other.niivue.broadcastTo(this.niivue, { '3d': true, '2d': false })
   }
 
-  /** What is seen now, drawn onto another canvas. */
-  copyTo(target: HTMLCanvasElement): void {
+  /** A surface drawn onto another canvas; whole at once, since others may be painted by the same view. */
+  async paint(surface: Surface, look: Look, frame: Surface, target: HTMLCanvasElement): Promise<void> {
+    await this.start()
+    Object.assign(this, { surface, look, planes: null, frame })
+    this.draw()
     this.niivue.drawScene()
     target.getContext('2d')!.drawImage(this.canvas, 0, 0, target.width, target.height)
   }

@@ -18,7 +18,7 @@ export class Gallery {
   private readonly seed = h('input', { type: 'number', min: 0, max: LARGEST_SEED, step: 1 })
   private readonly temperature: HTMLInputElement
   private readonly grid = h('ul', { class: 'shapes' })
-  private readonly painter = new SurfaceView(T.gallery.painter, { cube: false, size: 1.6 })
+  private readonly painter = new SurfaceView(T.gallery.painter, { cube: false, size: 1.3 })
   private readonly told = h('p', { class: 'hint', role: 'status' })
   private model: ModelDescription | null = null
   private working = new AbortController()
@@ -86,8 +86,7 @@ export class Gallery {
   private async paint(seed: number, canvas: HTMLCanvasElement, signal: AbortSignal): Promise<void> {
     const surface = readMz3(await this.api.bytes(`${this.path(seed)}&format=mz3`, signal))
     if (signal.aborted) return
-    await this.painter.show(surface, PLAIN_LOOK, null, frame(this.model!.half_extent_mm))
-    this.painter.copyTo(canvas)
+    await this.painter.paint(surface, PLAIN_LOOK, frame(this.model!.half_extent_mm), canvas)
     canvas.dataset['drawn'] = '1'
   }
 
