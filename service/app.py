@@ -17,10 +17,11 @@ from model.inference.modes import shape_modes
 from service.adapters.images import ImageLimits, read_masks, write_nifti
 from service.adapters.mesh_formats import write_mesh
 from service.adapters.per_model import PerModel
+from service.adapters.processes import compute_here
 from service.adapters.workers import WorkerPool
 from service.model_registry import ModelRegistry, load_registry
 from service.observability import Log, Metrics, make_log
-from service.ports import MaskReader
+from service.ports import Compute, MaskReader
 from service.routes.comparisons import comparisons_router
 from service.routes.dependencies import Services
 from service.routes.jobs import jobs_router
@@ -50,12 +51,19 @@ DESCRIPTION = (
 )
 
 
-def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log: Log | None = None) -> FastAPI:
+def create_app(
+    settings: Settings,
+    *,
+    registry: ModelRegistry | None = None,
+    compute: Compute = compute_here,
+    log: Log | None = None,
+) -> FastAPI:
     """The application.
 
     Args:
         settings: everything that an operator may choose.
         registry: the models; those that the settings name when None.
+        compute: where reconstructions and samples are computed.
         log: where log entries go; standard error when None.
     """
     engine = WorkerPool(settings.workers, settings.max_waiting)
@@ -66,6 +74,7 @@ def create_app(settings: Settings, *, registry: ModelRegistry | None = None, log
         registry=load_registry(settings) if registry is None else registry,
         store=store,
         engine=engine,
+        compute=compute,
         read_mask=mask_reader(settings),
         write_mesh=write_mesh,
         write_volume=write_nifti,

@@ -5,6 +5,7 @@ Exit status: 0 done, 2 the input is at fault (one sentence on standard error), 1
 
 import sys
 from collections.abc import Iterable, Sequence
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +16,7 @@ import yaml
 from threadpoolctl import threadpool_limits
 
 from model.errors import CohortError, InputError, MorphoFlowError, NotFound
+from service.adapters.processes import spread
 from service.app import create_app, interface_document, program_version
 from service.commands import OpenRegistry, models, reconstruct, sample
 from service.dicom_commands import audit, deidentify
@@ -22,7 +24,7 @@ from service.job_commands import jobs_commands
 from service.jobs.worker import run_worker, supervised_workers
 from service.mode_commands import modes
 from service.model_registry import load_registry
-from service.observability import uvicorn_logging
+from service.observability import make_log, uvicorn_logging
 from service.settings import Settings, load_settings, require_protection
 
 PROGRAM = "morphoflow"
@@ -106,11 +108,14 @@ def serve(
     settings = load_settings({name: value for name, value in given.items() if value is not None})
     require_protection(settings)
     registry = context.obj(settings)
-    app = create_app(settings, registry=registry)
+    helping = settings.model_copy(update={"threads": settings.threads or 1})
     typer.echo(f"Try it from another terminal:\n\n  {example_request(settings, registry.names())}\n", err=True)
-    with supervised_workers(settings.job_workers, app.state.services.log):
+    with (
+        spread(settings.workers - 1, partial(load_registry, helping)) as compute,
+        supervised_workers(settings.job_workers, make_log(settings.log_level)),
+    ):
         uvicorn.run(
-            app,
+            create_app(settings, registry=registry, compute=compute),
             host=settings.host,
             port=settings.port,
             root_path=settings.root_path,

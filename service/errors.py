@@ -5,6 +5,7 @@
     MorphoFlowError
     └── ServiceError
         ├── Overloaded             more work is waiting than allowed
+        ├── HelperLost             a process that computed an answer ended
         ├── StoreFull              a result larger than everything that may be kept
         ├── Unauthorised           no key, or a wrong one
         ├── NotAcceptable          none of the accepted media types can be made
@@ -50,6 +51,10 @@ class ServiceError(MorphoFlowError):
 
 class Overloaded(ServiceError):
     """More work is waiting than allowed."""
+
+
+class HelperLost(ServiceError):
+    """A process that computed an answer ended, for example for want of memory."""
 
 
 class StoreFull(ServiceError):
@@ -134,6 +139,7 @@ KINDS: dict[type[MorphoFlowError], Kind] = {
     UnknownJob: Kind(404, "unknown-job", "Unknown job"),
     NotComputed: Kind(404, "not-computed", "Not part of this result"),
     Overloaded: Kind(503, "overloaded", "Too much work is waiting"),
+    HelperLost: Kind(503, "computation-lost", "The computation was lost"),
     StoreFull: Kind(507, "store-full", "No room for the result"),
     Unauthorised: Kind(401, "unauthorised", "A key is needed"),
     NotAcceptable: Kind(406, "not-acceptable", "No acceptable media type"),

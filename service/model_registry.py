@@ -60,6 +60,10 @@ class ModelRegistry:
             raise UnknownModel(f"No loaded model has this name; loaded are: {', '.join(self.names()) or 'none'}.")
         return models[name]
 
+    def of_digest(self, digest: str) -> ShapeModel | None:
+        """The model of these contents, of any version."""
+        return next((model for model in self._models.values() if model.digest == digest), None)
+
     def refresh(self) -> bool:
         """Load what is new and drop what is gone; requests that run keep their model. Whether anything changed."""
         if self._reload is None:

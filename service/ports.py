@@ -16,7 +16,8 @@ from model.geometry import Grid
 from model.inference.mesh import Mesh
 from model.inference.modes import ShapeModes
 from model.inference.observations import MaskStack
-from model.inference.reconstruction import Options, Reconstruction
+from model.inference.reconstruction import Options, Reconstruction, Watch
+from model.interruption import Check
 
 T = TypeVar("T")
 #: Kinds of jobs of the interface: bulk sampling, one reconstruction in the background, one for each mask of an archive.
@@ -163,6 +164,22 @@ class ModeSource(Protocol):
 
     def __call__(self, model: ShapeModel, /) -> ShapeModes:
         """The same model gives the same modes."""
+        ...
+
+
+class Compute(Protocol):
+    """Calls a function of a model, in this process or in another one; as many at a time as there is room for."""
+
+    def __call__(
+        self, work: Callable[..., T], model: ShapeModel, *arguments: object, watch: Watch = ..., check: Check = ...
+    ) -> T:
+        """What ``work(model, *arguments, watch=watch, check=check)`` gives.
+
+        Args:
+            work: a function of a module, with arguments and a result that can be pickled.
+            watch: told the name of each stage as it begins.
+            check: called many times a second; what it raises ends the work.
+        """
         ...
 
 

@@ -12,6 +12,7 @@ import time
 from typing import Annotated
 
 import typer
+from threadpoolctl import threadpool_limits
 
 from benchmarks.load.figures import Figure, at_least, at_most, holds, say, told
 from benchmarks.load.traffic import MASK, send
@@ -59,11 +60,12 @@ def measure(duration_s: float, cores: int, load: float = 0.8) -> list[Figure]:
 
 
 def computing_s(repeats: int) -> float:
-    """CPU time (s) of one request's computation: from the file to the surface's file."""
+    """CPU time (s) of one request's computation: from the file to the surface's file, by one thread."""
     settings = load_settings({"threads": 1})
     model = load_registry(settings).get("hippocampus")
     read, data = mask_reader(settings), MASK.read_bytes()
     times = []
+    threadpool_limits(1, "blas")  # as the service has it
     for _ in range(repeats + 1):
         began = time.process_time()
         outcome = use_cases.reconstruct(model, read(data, "mask", None), Options(uncertainty="none"), lambda _: None)

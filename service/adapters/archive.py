@@ -31,7 +31,8 @@ ARCHIVE_VERSION = 2
 def write_outcome(folder: Path, outcome: Outcome, times: Mapping[str, float]) -> None:
     """Write an outcome, with the times of its life (s since 1970), into an existing folder."""
     np.savez(folder / STATE, allow_pickle=False, **_state_arrays(outcome.reconstruction.state))
-    np.savez_compressed(folder / MESH, allow_pickle=False, **_mesh_arrays(outcome.reconstruction.mesh))
+    # Coordinates hardly shrink, and compressing them takes longer than all else here.
+    np.savez(folder / MESH, allow_pickle=False, **_mesh_arrays(outcome.reconstruction.mesh))
     document = {"archive": ARCHIVE_VERSION, **times, **_document(outcome)}
     (folder / SUMMARY).write_text(json.dumps(document), encoding="utf-8")
 
@@ -198,9 +199,9 @@ def _state(arrays: dict[str, np.ndarray], documents: list[dict[str, Any]]) -> Sh
 
 def _mesh_arrays(mesh: Mesh) -> dict[str, np.ndarray]:
     scalars = {f"scalar_{name}": values for name, values in mesh.scalars.items()}
-    return {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, **scalars}
+    return {"vertices": mesh.vertices, "faces": mesh.faces.astype(np.int32), "normals": mesh.normals, **scalars}
 
 
 def _mesh(arrays: dict[str, np.ndarray]) -> Mesh:
     scalars = {name.removeprefix("scalar_"): values for name, values in arrays.items() if name.startswith("scalar_")}
-    return Mesh(arrays["vertices"], arrays["faces"], arrays["normals"], scalars)
+    return Mesh(arrays["vertices"], arrays["faces"].astype(np.int64), arrays["normals"], scalars)

@@ -45,6 +45,7 @@ class DiskResultStore:
         self._max_bytes = max_bytes
         self._clock = clock
         self._lock = threading.Lock()
+        self._sizes: dict[Path, int] = {}
 
     def save(self, outcome: Outcome, identifier: str | None = None) -> StoredResult:
         """Keep an outcome; `StoreFull` when it alone is larger than the store."""
@@ -56,6 +57,7 @@ class DiskResultStore:
             write_outcome(temporary, outcome, times)
             with self._lock:
                 self._remove(self._folder / identifier)
+                self._sizes.pop(self._folder / identifier, None)
                 self._make_room(_size(temporary))
                 temporary.rename(self._folder / identifier)
         except BaseException as fault:
@@ -112,13 +114,16 @@ class DiskResultStore:
     def _make_room(self, needed: int) -> None:
         if needed > self._max_bytes:
             raise StoreFull("The result is larger than all results that this service may keep together.")
-        sizes = {folder: _size(folder) for folder in self._results()}
-        total = sum(sizes.values()) + needed
-        for folder in sorted(sizes, key=self._expiry):
+        # What is kept does not change, so a folder's size is read once; other processes keep results here as well.
+        self._sizes = {folder: self._sizes.get(folder) or _size(folder) for folder in self._results()}
+        total = sum(self._sizes.values()) + needed
+        if total <= self._max_bytes:
+            return
+        for folder in sorted(self._sizes, key=self._expiry):
+            self._remove(folder)
+            total -= self._sizes[folder]
             if total <= self._max_bytes:
                 return
-            self._remove(folder)
-            total -= sizes[folder]
 
     def _remove(self, folder: Path) -> bool:
         grave = folder.with_name(f"{_TEMPORARY}{uuid.uuid4()}")

@@ -11,8 +11,10 @@ import numpy as np
 from model.bundle import ShapeModel
 from model.inference.mesh import volume_ml
 from model.inference.plausibility import volume_range_ml
+from model.inference.reconstruction import Watch
 from model.inference.sampling import SampledShape
 from model.inference.training_pairs import training_pair
+from model.interruption import Check, interruptible
 from service import use_cases
 from service.job_results import counts_of
 from service.ports import MeshWriter, SampleFormat, VolumeWriter
@@ -78,6 +80,14 @@ class SampleWriter:
                 return _pair(_label_map(model, shape, how), seed)
         said = {**provenance(model), "seed": seed}
         return self._write_mesh(shape.mesh, how.format.value, space=model.manifest.frame, metadata=said), {}
+
+
+def make_sample(
+    model: ShapeModel, writer: SampleWriter, seed: int, how: Draw, *, watch: Watch, check: Check
+) -> SampleFile:
+    """`SampleWriter.make` as a `Compute` calls it."""
+    watch("sampling")
+    return writer.make(interruptible(model, check), seed, how)
 
 
 def _label_map(model: ShapeModel, shape: SampledShape, how: Draw) -> use_cases.Volume:

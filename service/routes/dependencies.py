@@ -10,7 +10,7 @@ from model.bundle import ShapeModel
 from service.job_ports import BlobStore, JobEngine
 from service.model_registry import ModelRegistry
 from service.observability import Log, Metrics
-from service.ports import MaskReader, MeshWriter, ModeSource, ResultStore, Ticket, VolumeWriter, WorkEngine
+from service.ports import Compute, MaskReader, MeshWriter, ModeSource, ResultStore, Ticket, VolumeWriter, WorkEngine
 from service.settings import Settings
 
 
@@ -22,6 +22,7 @@ class Services:
     registry: ModelRegistry
     store: ResultStore
     engine: WorkEngine
+    compute: Compute
     read_mask: MaskReader
     write_mesh: MeshWriter
     write_volume: VolumeWriter

@@ -9,7 +9,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
 from model.errors import InputError, InvalidParameter, MorphoFlowError
-from service.errors import PROTOCOL_KINDS, Kind, Overloaded, Unauthorised, kind_of
+from service.errors import PROTOCOL_KINDS, HelperLost, Kind, Overloaded, Unauthorised, kind_of
 from service.schemas import Problem
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
@@ -111,7 +111,7 @@ def accepted_names(request: Request) -> list[str]:
 
 
 def _headers(error: MorphoFlowError, retry_after_s: int) -> dict[str, str] | None:
-    if isinstance(error, Overloaded):
+    if isinstance(error, Overloaded | HelperLost):
         return {"Retry-After": str(retry_after_s)}
     if isinstance(error, Unauthorised):
         return {"WWW-Authenticate": 'Bearer realm="morphoflow"'}

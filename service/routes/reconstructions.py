@@ -111,7 +111,8 @@ def _reconstruct(services: Services, form: ReconstructionForm, watch: Watch) -> 
         watch(stage)
         timer(stage)
 
-    outcome = use_cases.reconstruct(model, stacks, options, observed, partial(watch, "evaluation"))
+    check = partial(watch, "evaluation")
+    outcome = services.compute(use_cases.reconstruct, model, stacks, options, watch=observed, check=check)
     timer.finish()
     return services.store.save(outcome)
 

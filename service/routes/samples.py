@@ -1,6 +1,6 @@
 """``/v1/models/{model}/samples``: synthetic shapes, one or a ZIP that streams while it is made."""
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import aclosing
 from functools import partial
 from typing import Annotated
@@ -10,8 +10,9 @@ from starlette.responses import Response, StreamingResponse
 from zipstream import ZipStream  # type: ignore[import-untyped]
 
 from model.bundle import ShapeModel
+from model.inference.reconstruction import Watch
 from service import use_cases
-from service.adapters.sample_files import MANIFEST, Draw, SampleWriter, manifest_bytes
+from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, make_sample, manifest_bytes
 from service.ports import SampleFormat, Ticket
 from service.routes.caching import cached, caching_headers, is_held, not_modified
 from service.routes.connection import in_order, run_while_connected
@@ -59,7 +60,11 @@ async def read_sample(
     if is_held(request, headers):
         return not_modified(headers)
     how, writer = _draw(services, query), SampleWriter(services.write_mesh, services.write_volume)
-    file = await run_while_connected(request, ticket, lambda _: writer.make(model, seed, how))
+
+    def made(watch: Watch) -> SampleFile:
+        return services.compute(make_sample, model, writer, seed, how, check=partial(watch, "evaluation"))
+
+    file = await run_while_connected(request, ticket, made)
     return Response(file.data, media_type=sample_media_type(query.format), headers=headers | attachment(file.name))
 
 
@@ -73,16 +78,16 @@ async def read_batch(
     how = _draw(services, query)
     use_cases.require_step(model, how.spacing_mm, how.max_voxels)
     writer = SampleWriter(services.write_mesh, services.write_volume)
-    chunks = _zip_chunks(model, seeds, how, writer, ticket, services.settings.workers + 1)
+    works = (partial(services.compute, make_sample, model, writer, seed, how) for seed in seeds)
+    chunks = _zip_chunks(model, how, works, ticket, services.settings.workers + 1)
     return StreamingResponse(chunks, media_type=ZIP, headers=attachment(f"{model.manifest.name}-samples.zip"))
 
 
 async def _zip_chunks(
-    model: ShapeModel, seeds: range, how: Draw, writer: SampleWriter, ticket: Ticket, ahead: int
+    model: ShapeModel, how: Draw, works: Iterable[Callable[[], SampleFile]], ticket: Ticket, ahead: int
 ) -> AsyncIterator[bytes]:
     archive = ZipStream(sized=False)
     entries = []
-    works = (partial(writer.make, model, seed, how) for seed in seeds)
     async with aclosing(in_order(ticket, works, ahead)) as made:
         async for file in made:
             entries.append(file.entry)
