@@ -34,10 +34,13 @@ class Traffic:
         return float(np.quantile(self.seconds, share, method="higher")) if self.seconds else float("nan")
 
 
-def send(server: Server, *, users: int, rate: float = 0.0, duration_s: float, kind: str = "none") -> Traffic:
+def send(
+    server: Server, *, users: int, rate: float = 0.0, duration_s: float, kind: str = "none", by_chance: bool = False
+) -> Traffic:
     """Let so many users send requests; `rate` of all of them together (1/s), 0 for one request after the other.
 
     Args:
+        by_chance: whether users' requests come at random times (Poisson) rather than at an even pace.
         kind: uncertainty of the reconstructions, or ``mixed`` for requests of every kind.
     """
     command = [sys.executable, "-m", "locust", "-f", str(_USERS), "--headless", "--json", "--skip-log"]
@@ -50,6 +53,7 @@ def send(server: Server, *, users: int, rate: float = 0.0, duration_s: float, ki
             "LOAD_RATE": str(rate / users),
             "LOAD_USERS": str(users),
             "LOAD_KIND": kind,
+            "LOAD_CHANCE": "1" if by_chance else "",
             "LOAD_TIMES": str(times),
         }
         done = subprocess.run([*command, "--stop-timeout", "60"], env=environment, check=False, capture_output=True)

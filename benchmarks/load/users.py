@@ -1,22 +1,24 @@
 """What locust runs: users that send requests made beforehand, as cheaply as can be, and keep each answer's time.
 
 The environment says how: LOAD_MASK (file), LOAD_RATE (requests a second of each user, 0 for as many as are answered),
-LOAD_USERS, LOAD_KIND (`none`, `laplace`: reconstructions; `mixed`: of every kind that the service answers) and
+LOAD_USERS, LOAD_CHANCE (requests come by chance rather than at an even pace), LOAD_KIND (`none`, `laplace`: reconstructions; `mixed`: of every kind that the service answers) and
 LOAD_TIMES (file that the times of answers (s) are written to at the end).
 """
 
 import itertools
 import json
 import os
+import random
 import time
 from pathlib import Path
 from typing import Any
 
-from locust import FastHttpUser, constant_throughput, events, task
+from locust import FastHttpUser, events, task
 from urllib3 import encode_multipart_formdata
 
 RATE, USERS = float(os.environ.get("LOAD_RATE", "0")), int(os.environ.get("LOAD_USERS", "1"))
 KIND = os.environ.get("LOAD_KIND", "none")
+CHANCE = bool(os.environ.get("LOAD_CHANCE"))
 TIMES: list[float] = []
 #: Body and headers.
 Prepared = tuple[bytes, dict[str, str]]
@@ -60,14 +62,22 @@ class Caller(FastHttpUser):
 
     numbers = itertools.count()
     network_timeout = connection_timeout = 120.0
-    if RATE:
-        wait_time = constant_throughput(RATE)
 
     def on_start(self) -> None:
         """Wait for the own place among the beats."""
         self.turn = next(self.numbers)
+        self.beat = time.monotonic()
         if RATE:
             time.sleep(self.turn / (RATE * USERS))
+            self.beat = time.monotonic()
+
+    def wait_time(self) -> float:
+        """Time (s) until the own next beat; beats that were missed are left out."""
+        if not RATE:
+            return 0.0
+        pause = random.expovariate(RATE) if CHANCE else 1.0 / RATE
+        self.beat = max(self.beat + pause, time.monotonic())
+        return self.beat - time.monotonic()
 
     @task
     def ask(self) -> None:
