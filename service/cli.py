@@ -31,6 +31,8 @@ PROGRAM = "morphoflow"
 #: Packages that bring further commands register a callable that takes the typer application.
 COMMAND_GROUP = "morphoflow.commands"
 BAD_INPUT, FAULT = 2, 1
+#: An idle connection stays open so long (s): longer than a load balancer's, so that it never sends into one that closes.
+KEEP_ALIVE_S = 75
 
 VersionOption = Annotated[bool, typer.Option("--version", help="Print the version.")]
 
@@ -123,6 +125,7 @@ def serve(
             log_config=uvicorn_logging(settings.log_level),
             server_header=False,
             timeout_graceful_shutdown=30,
+            timeout_keep_alive=KEEP_ALIVE_S,
         )
 
 

@@ -1,8 +1,9 @@
 """What locust runs: users that send requests made beforehand, as cheaply as can be, and keep each answer's time.
 
 The environment says how: LOAD_MASK (file), LOAD_RATE (requests a second of each user, 0 for as many as are answered),
-LOAD_USERS, LOAD_CHANCE (requests come by chance rather than at an even pace), LOAD_KIND (`none`, `laplace`: reconstructions; `mixed`: of every kind that the service answers) and
-LOAD_TIMES (file that the times of answers (s) are written to at the end).
+LOAD_USERS, LOAD_CHANCE (requests come by chance rather than at an even pace), LOAD_KIND (`none`, `laplace`:
+reconstructions; `mixed`: of every kind that the service answers) and LOAD_TIMES (file that the times of answers (s)
+are written to at the end).
 """
 
 import itertools
