@@ -31,7 +31,7 @@ PROGRAM = "morphoflow"
 #: Packages that bring further commands register a callable that takes the typer application.
 COMMAND_GROUP = "morphoflow.commands"
 BAD_INPUT, FAULT = 2, 1
-#: An idle connection stays open so long (s): longer than a load balancer's, so that it never sends into one that closes.
+#: An idle connection stays open so long (s): longer than at a load balancer, which would send into a closing one.
 KEEP_ALIVE_S = 75
 
 VersionOption = Annotated[bool, typer.Option("--version", help="Print the version.")]
