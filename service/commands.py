@@ -2,9 +2,10 @@
 
 import zipfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -20,11 +21,12 @@ from model.inference.reconstruction import Options, UncertaintyRule
 from service import use_cases
 from service.adapters.images import write_nifti
 from service.adapters.mesh_formats import write_mesh
-from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, manifest_bytes
+from service.adapters.processes import spread
+from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, make_sample, manifest_bytes
 from service.app import mask_reader
 from service.console import echo_json, in_order, progress, require_free, require_suffix
-from service.model_registry import ModelRegistry
-from service.ports import MeshFormat, Outcome, SampleFormat
+from service.model_registry import ModelRegistry, load_registry
+from service.ports import Compute, MeshFormat, Outcome, SampleFormat
 from service.presentation import model_summary, summary_of
 from service.schemas import EstimateSchema, ModelList, Summary, parse_annotated, parse_labels
 from service.settings import Settings, load_settings
@@ -36,6 +38,8 @@ STEPS = 5
 
 #: Finds the models that the settings ask for; the application carries it to its commands.
 OpenRegistry = Callable[[Settings], ModelRegistry]
+#: A helper takes as long to start as some dozen shapes take to draw.
+SHAPES_FOR_HELPER = 32
 
 ModelOption = Annotated[str | None, typer.Option(help="Model name; may be left out when only one is loaded.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
@@ -111,11 +115,14 @@ def sample(
     chosen = context.obj(settings).get(model)
     seeds = use_cases.batch_seeds(seed, count, use_cases.MAX_SEED)
     how = Draw(format, temperature, spacing_mm, settings.max_voxels, reject)
-    if output.suffix.lower() == ".zip":
-        require_free({"--output": output}, force=force)
-        manifest = _sample_to_zip(chosen, seeds, how, output, settings.workers)
-    else:
-        manifest = _sample_to_folder(chosen, seeds, how, output, settings.workers, force=force)
+    helpers = min(settings.workers - 1, count // SHAPES_FOR_HELPER)
+    with spread(helpers, partial(load_registry, settings)) as compute:
+        batch = _Batch(chosen, seeds, how, compute, helpers + 1)
+        if output.suffix.lower() == ".zip":
+            require_free({"--output": output}, force=force)
+            manifest = _sample_to_zip(batch, output)
+        else:
+            manifest = _sample_to_folder(batch, output, force=force)
     typer.echo(manifest.decode() if as_json else f"{count} shapes of {chosen.manifest.name} written.")
 
 
@@ -165,32 +172,47 @@ def _write_volume(
     path.write_bytes(write_nifti(volume.array, volume.grid, compute.__name__.replace("_", " ")))
 
 
-def _sample_to_zip(model: ShapeModel, seeds: range, how: Draw, target: Path, workers: int) -> bytes:
+@dataclass(frozen=True)
+class _Batch:
+    """Shapes to be drawn, so many at the same time."""
+
+    model: ShapeModel
+    seeds: range
+    how: Draw
+    compute: Compute
+    workers: int
+
+    def write(self, put: Callable[[SampleFile], object]) -> bytes:
+        """Put every shape's file, in order; the manifest of all."""
+        writer, entries = SampleWriter(write_mesh, write_nifti), []
+
+        def make(seed: int) -> SampleFile:
+            return self.compute(make_sample, self.model, writer, seed, self.how)
+
+        with progress(len(self.seeds)) as step:
+            for seed, file in zip(self.seeds, in_order(make, self.seeds, self.workers), strict=True):
+                step(f"seed {seed}")
+                put(file)
+                entries.append(file.entry)
+        return manifest_bytes(self.model, self.how, entries)
+
+
+def _sample_to_zip(batch: _Batch, target: Path) -> bytes:
     with zipfile.ZipFile(target, "w") as archive:
-        manifest = _make_all(model, seeds, how, lambda file: archive.writestr(file.name, file.data), workers)
+        manifest = batch.write(lambda file: archive.writestr(file.name, file.data))
         archive.writestr(MANIFEST, manifest)
     return manifest
 
 
-def _sample_to_folder(model: ShapeModel, seeds: range, how: Draw, target: Path, workers: int, *, force: bool) -> bytes:
+def _sample_to_folder(batch: _Batch, target: Path, *, force: bool) -> bytes:
     if target.exists() and not target.is_dir():
         raise InvalidParameter("--output must be a folder or end with .zip.", part="--output")
     if not force and target.is_dir() and any(target.iterdir()):
         raise InvalidParameter("--output names a folder that is not empty; --force writes into it.", part="--output")
     target.mkdir(parents=True, exist_ok=True)
-    manifest = _make_all(model, seeds, how, lambda file: (target / file.name).write_bytes(file.data), workers)
+    manifest = batch.write(lambda file: (target / file.name).write_bytes(file.data))
     (target / MANIFEST).write_bytes(manifest)
     return manifest
-
-
-def _make_all(model: ShapeModel, seeds: range, how: Draw, put: Callable[[SampleFile], Any], workers: int) -> bytes:
-    writer, entries = SampleWriter(write_mesh, write_nifti), []
-    with progress(len(seeds)) as step:
-        for seed, file in zip(seeds, in_order(partial(writer.make, model, how=how), seeds, workers), strict=True):
-            step(f"seed {seed}")
-            put(file)
-            entries.append(file.entry)
-    return manifest_bytes(model, how, entries)
 
 
 def _sentences(summary: Summary) -> str:
