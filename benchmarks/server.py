@@ -37,8 +37,8 @@ class Server:
         return sum(_cpu_s(pid) for pid in self.family())
 
     def memory_mib(self) -> float:
-        """Resident memory of the service's own process (MiB; Linux only)."""
-        return _status_kib(self.process.pid, "VmRSS:") / 1024.0
+        """Resident memory of the process and its children, summed over them (MiB; Linux only)."""
+        return sum(_status_kib(pid, "VmRSS:") for pid in self.family()) / 1024.0
 
     def peak_memory_mib(self) -> float:
         """Largest resident memory of the process and its children so far, summed over them (MiB; Linux only)."""
