@@ -34,7 +34,7 @@ class Server:
 
     def cpu_s(self) -> float:
         """Time (s) that the processes that live now have computed so far (Linux only)."""
-        return sum(_cpu_s(pid) for pid in self.family())
+        return sum(cpu_s(pid) for pid in self.family())
 
     def memory_mib(self) -> float:
         """Resident memory of the process and its children, summed over them (MiB; Linux only)."""
@@ -112,6 +112,7 @@ def _status_kib(pid: int, name: str) -> int:
     return next((int(line.split()[1]) for line in lines if line.startswith(name)), 0)
 
 
-def _cpu_s(pid: int) -> float:
+def cpu_s(pid: int) -> float:
+    """Time (s) that a process has computed so far (Linux only)."""
     words = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")

@@ -105,12 +105,11 @@ class Processes:
                 answer: T = done.value
                 return answer
             return work(model, *arguments, watch=watch, check=check)
-        except HelperLost:
-            self._replace(seat)
-            raise
         finally:
             if seat.helper is None or seat.helper.alive:
                 self._seats.put(seat)
+            else:
+                self._replace(seat.rank, seat.helper)
 
     def free(self) -> int:
         """How many more calls could compute now."""
@@ -123,12 +122,11 @@ class Processes:
         for helper in helpers:
             helper.close()
 
-    def _replace(self, seat: _Seat) -> None:
-        if seat.helper is not None:
-            with self._lock:
-                self._helpers.discard(seat.helper)
-            seat.helper.close()
-        self._begin(seat.rank)
+    def _replace(self, rank: int, lost: "_Helper") -> None:
+        with self._lock:
+            self._helpers.discard(lost)
+        lost.close()
+        self._begin(rank)
 
     def _begin(self, rank: int) -> None:
         """Start a helper; it gets its seat once it has opened its models."""
@@ -183,8 +181,11 @@ class _Helper:
     def call(
         self, work: Callable[..., T], model: ShapeModel, arguments: tuple[object, ...], watch: Watch, check: Check
     ) -> _Done | None:
-        """What the work gives; None when the helper does not have this model."""
-        self._through(lambda: self._connection.send((work, model.digest, arguments)))
+        """What the work gives; None when the helper does not have this model, or died before it was asked."""
+        try:
+            self._through(lambda: self._connection.send((work, model.digest, arguments)))
+        except HelperLost:
+            return None
         try:
             kind, *content = self._last_word(watch, check)
         except HelperLost:

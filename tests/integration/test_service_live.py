@@ -8,10 +8,13 @@ import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import httpx
 
+from benchmarks.server import cpu_s
+from benchmarks.server import serving as shipped_service
 from tests.service_parts import NAME, app_for, mask_parts, running
 
 PROGRAM = """
@@ -115,3 +118,20 @@ def test_behind_a_proxy_links_carry_its_prefix(tmp_path):
         assert client.get("/v1/models").json()["models"][0]["link"] == f"/shape/v1/models/{NAME}"
         assert httpx.get(f"{client.base_url}/healthz").status_code == 200
         assert httpx.get(f"{client.base_url}/v1/models").status_code == 401
+
+
+def test_requests_at_the_same_time_are_computed_in_several_processes(shipped_bundles, repository):  # noqa: ARG001
+    mask = (repository / "docs" / "examples" / "hippocampus_three_slices.nii.gz").read_bytes()
+
+    def ask(_):
+        form, accept = {"model": "hippocampus", "uncertainty": "none"}, {"Accept": "model/stl"}
+        url = f"{server.client.base_url}/v1/reconstructions"
+        return httpx.post(url, files=mask_parts(mask), data=form, headers=accept, timeout=60.0)
+
+    with shipped_service((), {"MORPHOFLOW_WORKERS": "2"}) as server, ThreadPoolExecutor(4) as pool:
+        before = {pid: cpu_s(pid) for pid in server.family()}
+        answers = list(pool.map(ask, range(12)))
+        worked = [pid for pid in server.family() if cpu_s(pid) - before.get(pid, 0.0) > 0.3]
+    assert {answer.status_code for answer in answers} == {200}
+    assert len({answer.content for answer in answers}) == 1
+    assert len(worked) >= 2

@@ -156,6 +156,14 @@ def test_a_helper_that_dies_costs_one_call_and_another_takes_its_place(processes
     assert after not in (before, os.getpid())
 
 
+def test_a_helper_that_died_while_nothing_was_asked_of_it_costs_nothing(processes, model):
+    os.kill(elsewhere(processes, model, where)[0], signal.SIGKILL)
+    time.sleep(0.2)
+    assert elsewhere(processes, model, where)[0] == os.getpid()
+    wait_for_helper(processes)
+    assert elsewhere(processes, model, where)[0] != os.getpid()
+
+
 def test_helpers_end_with_the_context():
     with spread(1, open_models) as opened:
         wait_for_helper(opened)
