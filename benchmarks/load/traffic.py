@@ -18,11 +18,12 @@ _USERS = Path(__file__).with_name("users.py")
 
 @dataclass(frozen=True)
 class Traffic:
-    """Answers of one run: how many, how many failed, how long they took, and over which time."""
+    """Answers of one run: how long they took, how many failed, over which time, and what the sending itself took."""
 
     seconds: tuple[float, ...]
     failed: int
     duration_s: float
+    sender_cpu_s: float
 
     @property
     def rate(self) -> float:
@@ -59,7 +60,8 @@ def send(
         done = subprocess.run([*command, "--stop-timeout", "60"], env=environment, check=False, capture_output=True)
         if not done.stdout.strip() or not times.exists():
             raise SystemExit(f"locust did not run: {done.stderr.decode(errors='replace')[-500:]}")
-        entries, seconds = json.loads(done.stdout), json.loads(times.read_text())
+        entries, kept = json.loads(done.stdout), json.loads(times.read_text())
     first = min(entry["start_time"] for entry in entries)
     span_s = max(max(entry["last_request_timestamp"] for entry in entries) - first, 1e-9)
-    return Traffic(tuple(seconds), sum(entry["num_failures"] for entry in entries), span_s)
+    failed = sum(entry["num_failures"] for entry in entries)
+    return Traffic(tuple(kept["seconds"]), failed, span_s, kept["own_cpu_s"])

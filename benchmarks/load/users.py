@@ -3,7 +3,7 @@
 The environment says how: LOAD_MASK (file), LOAD_RATE (requests a second of each user, 0 for as many as are answered),
 LOAD_USERS, LOAD_CHANCE (requests come by chance rather than at an even pace), LOAD_KIND (`none`, `laplace`:
 reconstructions; `mixed`: of every kind that the service answers) and LOAD_TIMES (file that the times of answers (s)
-are written to at the end).
+and the processor time of the sending are written to at the end).
 """
 
 import itertools
@@ -21,6 +21,8 @@ RATE, USERS = float(os.environ.get("LOAD_RATE", "0")), int(os.environ.get("LOAD_
 KIND = os.environ.get("LOAD_KIND", "none")
 CHANCE = bool(os.environ.get("LOAD_CHANCE"))
 TIMES: list[float] = []
+#: Processor time (s) of this process when the sending began.
+BEGUN: list[float] = []
 #: Body and headers.
 Prepared = tuple[bytes, dict[str, str]]
 
@@ -50,10 +52,16 @@ def _keep(response_time: float, exception: BaseException | None, **_: object) ->
         TIMES.append(response_time / 1000.0)
 
 
+def _begin(**_: object) -> None:
+    BEGUN.append(time.process_time())
+
+
 def _write(**_: object) -> None:
-    Path(os.environ["LOAD_TIMES"]).write_text(json.dumps(TIMES))
+    own_cpu_s = time.process_time() - BEGUN[0]
+    Path(os.environ["LOAD_TIMES"]).write_text(json.dumps({"seconds": TIMES, "own_cpu_s": own_cpu_s}))
 
 
+events.test_start.add_listener(_begin)
 events.request.add_listener(_keep)
 events.quitting.add_listener(_write)
 
