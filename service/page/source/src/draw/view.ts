@@ -2,10 +2,11 @@
 
 import { type Api, formOf, isAbort, resultPath, sentence } from '../api'
 import { scaleFromZero } from '../colour'
-import { button, field, h, mark, option, replace } from '../dom'
+import { button, field, h, mark, replace } from '../dom'
 import { PLANES, planeName } from '../grid'
 import { LookControls, slider } from '../look'
 import { readMz3 } from '../mesh'
+import { modelOptions } from '../models'
 import { readNifti, writeNifti } from '../nifti'
 import { Pane } from '../pane'
 import { dismiss, remember } from '../results'
@@ -53,7 +54,7 @@ export class DrawView {
   async start(): Promise<void> {
     try {
       const models = await this.api.models()
-      replace(this.model, ...models.map((model) => option(model.name, T.request.modelName(model))))
+      replace(this.model, ...modelOptions(models))
       await this.begin(null)
     } catch (fault) {
       this.status.fail(sentence(fault))

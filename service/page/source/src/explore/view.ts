@@ -1,7 +1,8 @@
 /** Sampled shapes, modes as sliders, and two results beside each other. */
 
 import { type Api, sentence } from '../api'
-import { field, h, option, replace } from '../dom'
+import { field, h, replace } from '../dom'
+import { modelOptions } from '../models'
 import { rewrite } from '../route'
 import { Status } from '../status'
 import { T } from '../text'
@@ -36,7 +37,7 @@ export class ExploreView {
   async start(): Promise<void> {
     try {
       const models = await this.api.models()
-      replace(this.model, ...models.map((model) => option(model.name, T.request.modelName(model), model.name === this.wanted)))
+      replace(this.model, ...modelOptions(models, this.wanted))
       await this.choose()
     } catch (fault) {
       this.status.fail(sentence(fault))

@@ -2,10 +2,10 @@
 
 import type { Api } from '../api'
 import { button, field, h, option, replace } from '../dom'
+import { EXAMPLE_MODEL, modelOptions } from '../models'
 import { T } from '../text'
 
 export const EXAMPLE = 'page/example_hippocampus.nii.gz'
-const EXAMPLE_MODEL = 'hippocampus'
 const SUFFIXES = '.nii,.nii.gz,.gz,.nrrd,.seg.nrrd,.nhdr,.mha,.mhd,.dcm,application/dicom'
 
 export class RequestForm {
@@ -33,7 +33,7 @@ export class RequestForm {
 
   async loadModels(): Promise<void> {
     const models = await this.api.models()
-    replace(this.model, ...models.map((model) => option(model.name, T.request.modelName(model))))
+    replace(this.model, ...modelOptions(models))
   }
 
   get modelName(): string {
