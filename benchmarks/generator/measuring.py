@@ -1,9 +1,10 @@
 """What is measured of a generator; every figure with its definition."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -79,12 +80,16 @@ def draw_all(model: ShapeModel, plan: Plan) -> Draws:
 
 
 def _compactness(model: ShapeModel, active: tuple[int, int, int]) -> list[Figure]:
-    size = model.manifest.latent_size
+    facts: Mapping[str, Any] = model.manifest.training.get("pruned") or {}
+    size = int(facts.get("dimensions_before", model.manifest.latent_size))
     counts = [
         Figure(f"dimensions for {share} % of the surface's variance", float(n))
         for share, n in zip((95, 97, 99), active, strict=True)
     ]
-    return [*counts, Figure("share of dimensions beyond 99 %", 1.0 - active[-1] / size, limit=0.35, at_most=False)]
+    return [
+        *counts,
+        Figure(f"share of {size} trained dimensions beyond 99 %", 1.0 - active[-1] / size, limit=0.35, at_most=False),
+    ]
 
 
 def _distributions(model: ShapeModel, draws: Draws, training: Sequence[Surface]) -> list[Figure]:
