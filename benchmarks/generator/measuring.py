@@ -4,7 +4,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -80,8 +79,8 @@ def draw_all(model: ShapeModel, plan: Plan) -> Draws:
 
 
 def _compactness(model: ShapeModel, active: tuple[int, int, int]) -> list[Figure]:
-    facts: Mapping[str, Any] = model.manifest.training.get("pruned") or {}
-    size = int(facts.get("dimensions_before", model.manifest.latent_size))
+    pruned = model.manifest.training.get("pruned")
+    size = int(pruned["dimensions_before"]) if isinstance(pruned, Mapping) else model.manifest.latent_size
     counts = [
         Figure(f"dimensions for {share} % of the surface's variance", float(n))
         for share, n in zip((95, 97, 99), active, strict=True)
