@@ -10,7 +10,7 @@ them (a discrepancy in the sense of Kennedy and O'Hagan, 2001). All in the canon
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -136,6 +136,10 @@ class Discrepancy:
         seen = self.covariance.between(self.points, means_of(cells, canonical)) @ total
         explained = solve_triangular(self._factor[0], seen.astype(float), lower=True)
         return max(0.0, self.covariance.quadratic_form(canonical, weights) - float(explained @ explained))
+
+    def __getstate__(self) -> dict[str, object]:
+        """What it was made of; what is computed from that is several times as large and does not travel."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
     def _gram(self) -> Float[np.ndarray, "n n"]:

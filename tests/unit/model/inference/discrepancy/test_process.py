@@ -1,5 +1,6 @@
 """The conditioned process against Gaussian process regression written out."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -49,6 +50,15 @@ def test_sum_on_a_lattice_is_the_sum_at_its_nodes():
 def test_mean_is_that_of_regression():
     expected = written_out(PLACES, POINTS) @ np.linalg.solve(GRAM, PROCESS.residuals)
     np.testing.assert_allclose(PROCESS.mean(PLACES), expected, atol=0.02)
+
+
+def test_what_travels_is_what_it_was_made_of():
+    before = PROCESS.mean(PLACES), PROCESS.variance(PLACES)
+    travelled = pickle.dumps(PROCESS)
+    assert len(travelled) < 2 * sum(values.nbytes for values in (POINTS, PROCESS.residuals, PROCESS.jacobian))
+    there = pickle.loads(travelled)
+    for here, found in zip(before, (there.mean(PLACES), there.variance(PLACES)), strict=True):
+        np.testing.assert_array_equal(here, found)
 
 
 def test_gradient_is_that_of_the_mean():
