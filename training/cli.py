@@ -98,6 +98,9 @@ def export(
     name: Annotated[str | None, typer.Option(help="Name of the model; the cohort's when left out.")] = None,
     version: Annotated[str, typer.Option(help="Version of the model.")] = "1",
     prune: Annotated[bool, typer.Option("--prune", help="Only the dimensions that ARD kept alive.")] = False,
+    resolution_mm: Annotated[
+        float, typer.Option(min=0.25, max=10.0, help="Grid step of surfaces (mm) unless a request names another.")
+    ] = 1.0,
     anatomy: Annotated[
         str | None, typer.Option(help="SNOMED CT code of the structure and its meaning, '67453005 Talus'.")
     ] = None,
@@ -107,7 +110,15 @@ def export(
     with exit_status():
         from training.release import export_run
 
-        manifest = export_run(run, output, name=name, version=version, prune=prune, anatomy=anatomy_code(anatomy))
+        manifest = export_run(
+            run,
+            output,
+            name=name,
+            version=version,
+            prune=prune,
+            anatomy=anatomy_code(anatomy),
+            resolution_mm=resolution_mm,
+        )
         summary = {
             "bundle": str(output),
             "name": manifest.name,

@@ -39,6 +39,7 @@ def export_run(
     accuracy: Mapping[str, Mapping[str, float]] | None = None,
     prune: bool = False,
     anatomy: Mapping[str, str] | None = None,
+    resolution_mm: float = RESOLUTION_MM,
 ) -> Manifest:
     """Write the bundle of a finished run, of its live dimensions alone with `prune` (`training.pruning`).
 
@@ -70,7 +71,7 @@ def export_run(
         sigmas=tuple(sigmas.tolist()),
         active_dimensions=active_dimensions(sigmas),
         half_extent_mm=(record["half_extent_mm"][0], record["half_extent_mm"][1], record["half_extent_mm"][2]),
-        resolution_mm=RESOLUTION_MM,
+        resolution_mm=resolution_mm,
         likelihood_precision=likelihood_precision,
         calibration={},
         training={**training_facts(config, record), **({} if less is None else {"pruned": less.facts()})},

@@ -61,6 +61,8 @@ def bundle(tmp_path_factory, run):
         "2.1",
         "--anatomy",
         "102298001 Egg",
+        "--resolution-mm",
+        "0.8",
         "--json",
     )
     assert result.exit_code == 0, result.stderr
@@ -171,6 +173,7 @@ class TestExport:
         opened = open_bundle(bundle)
         manifest = opened.manifest
         assert (manifest.name, manifest.version, manifest.latent_size) == ("egg", "2.1", 3)
+        assert manifest.resolution_mm == 0.8
         assert manifest.anatomy == {"value": "102298001", "scheme": "SCT", "meaning": "Egg"}
         assert manifest.training["shapes"] == len(opened.population.codes) == 5
         assert np.allclose(opened.population.volumes_ml, 4 / 3 * np.pi * 0.72, rtol=0.2)
