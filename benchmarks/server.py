@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -13,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
+
+from benchmarks.ports import free_port
 
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 30.0
@@ -51,9 +52,7 @@ def serving(models: tuple[Path, ...], settings: Mapping[str, str] | None = None)
 
     Without workers for jobs unless a setting (by its environment variable) says otherwise.
     """
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
+    port = free_port()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as results:
         environment = {
             **os.environ,

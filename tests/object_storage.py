@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from socket import create_server
 from urllib.request import urlopen
 
 import boto3
 from botocore.config import Config
+
+from benchmarks.ports import free_ports
 
 BUCKET = "morphoflow"
 #: What clients take from the environment.
@@ -41,7 +42,7 @@ def is_installed() -> bool:
 @contextmanager
 def object_storage(root: Path) -> Iterator[str]:
     """Address of storage with one empty bucket."""
-    ports = dict(zip((*_STORES, "proxy"), _free_ports(4), strict=True))
+    ports = dict(zip((*_STORES, "proxy"), free_ports(4), strict=True))
     _configure(root, ports)
     with ExitStack() as stack:
         for name in ports:
@@ -83,11 +84,6 @@ def _configure(root: Path, ports: dict[str, int]) -> None:
 
 def _program(name: str) -> Path:
     return Path(sys.executable).with_name(name)
-
-
-def _free_ports(count: int) -> list[int]:
-    with ExitStack() as stack:
-        return [stack.enter_context(create_server(("127.0.0.1", 0))).getsockname()[1] for _ in range(count)]
 
 
 def _await(url: str) -> None:

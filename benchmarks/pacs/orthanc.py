@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import time
 from collections.abc import Iterator
@@ -84,17 +83,6 @@ class Orthanc:
 def is_installed() -> bool:
     """Whether Orthanc, its plugin and dcmtk's storescu are there."""
     return bool(shutil.which("Orthanc") and shutil.which("storescu", path=SYSTEM_PATH)) and PLUGIN.exists()
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports that nothing listens on."""
-    probes = [socket.socket() for _ in range(count)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    ports = [int(probe.getsockname()[1]) for probe in probes]
-    for probe in probes:
-        probe.close()
-    return ports
 
 
 @contextmanager

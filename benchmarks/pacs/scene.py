@@ -22,8 +22,9 @@ from rich.table import Table
 
 from benchmarks.load.figures import Figure, at_most, holds
 from benchmarks.pacs.drawings import EXAMPLE, as_seg, placed, real_series, series_around, three_planes
-from benchmarks.pacs.orthanc import BY_DICOMWEB, BY_DIMSE, Orthanc, free_ports, is_installed, running_orthanc, send
+from benchmarks.pacs.orthanc import BY_DICOMWEB, BY_DIMSE, Orthanc, is_installed, running_orthanc, send
 from benchmarks.pacs.stage import Place, by_dicomweb, by_dimse, running_service, write_file
+from benchmarks.ports import free_ports
 from model.geometry import Grid
 from service.adapters.dicom.masks import stacks_of_object
 from service.adapters.dicom.results import RESULTS

@@ -22,8 +22,9 @@ from pynetdicom import AE
 
 from benchmarks.load.figures import Figure, holds, told
 from benchmarks.pacs.drawings import EXAMPLE, as_seg, placed, series_around, three_planes
-from benchmarks.pacs.orthanc import BY_DIMSE, Orthanc, free_ports, running_orthanc, send
+from benchmarks.pacs.orthanc import BY_DIMSE, Orthanc, running_orthanc, send
 from benchmarks.pacs.stage import Place, by_dicomweb, kill, start, write_file
+from benchmarks.ports import free_ports
 from benchmarks.server import wait_until_ready
 from model.geometry import Grid
 from service.adapters.dicom.results import RESULTS

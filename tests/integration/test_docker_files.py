@@ -182,7 +182,8 @@ class TestInstalledService:
     ) -> None:
         example = repository / "docs" / "examples" / "hippocampus_three_slices.nii.gz"
         target = tmp_path / f"mesh.{format}"
-        command = (installation / "morphoflow", "reconstruct", example, "--output", target, "--uncertainty", "none")
+        words = ("--model", "hippocampus", "--uncertainty", "none")
+        command = (installation / "morphoflow", "reconstruct", example, "--output", target, *words)
         made = self.command(installation, tmp_path, *command)
         assert made.returncode == 0, made.stderr
         assert target.stat().st_size > 0

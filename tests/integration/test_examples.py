@@ -5,7 +5,6 @@ import os
 import re
 import shlex
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -18,6 +17,8 @@ import nibabel as nib
 import numpy as np
 import pytest
 import trimesh
+
+from benchmarks.ports import free_port
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("shipped_bundles")]
 
@@ -41,9 +42,7 @@ def is_ready(address: str) -> bool:
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A service with the models that ship."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = str(probe.getsockname()[1])
+    port = str(free_port())
     environment = {**os.environ, "MORPHOFLOW_RESULTS_FOLDER": str(tmp_path_factory.mktemp("results"))}
     program = Path(sys.executable).with_name("morphoflow")
     service = subprocess.Popen([program, "serve", "--port", port], env=environment, stderr=subprocess.DEVNULL)

@@ -9,11 +9,11 @@ import time
 import zipfile
 from contextlib import contextmanager
 from pathlib import Path
-from socket import create_server
 
 import httpx
 import pytest
 
+from benchmarks.ports import free_port
 from tests.job_parts import ended
 from tests.service_parts import mask_bytes
 
@@ -34,7 +34,9 @@ def environment(tmp_path, repository: Path):
     program.write_text(
         "import service.model_registry as registry\n"
         "from tests.analytic_model import ellipsoid_model\n"
-        "registry.load_registry = lambda s: registry.ModelRegistry({'ellipsoid': ellipsoid_model('ellipsoid')})\n"
+        "def load_registry(settings):\n"
+        "    return registry.ModelRegistry({'ellipsoid': ellipsoid_model('ellipsoid')})\n"
+        "registry.load_registry = load_registry\n"
     )
     return {
         **os.environ,
@@ -48,8 +50,7 @@ def environment(tmp_path, repository: Path):
 
 @contextmanager
 def serving(environment):
-    with create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [sys.executable, "-c", PROGRAM, "serve", "--port", str(port)]
     with (
         subprocess.Popen(command, env=environment) as server,

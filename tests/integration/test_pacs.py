@@ -21,7 +21,8 @@ import pytest
 from pydicom import Dataset, dcmread
 from pynetdicom import AE
 
-from benchmarks.pacs.orthanc import Orthanc, free_ports, is_installed, running_orthanc, send
+from benchmarks.pacs.orthanc import Orthanc, is_installed, running_orthanc, send
+from benchmarks.ports import free_ports
 from service.adapters.blobs import FolderBlobs
 from service.adapters.dicom.results import RESULTS
 from service.adapters.image_guard import ImageLimits

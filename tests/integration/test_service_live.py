@@ -4,7 +4,6 @@ import os
 import pty
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,6 +12,7 @@ from contextlib import contextmanager
 
 import httpx
 
+from benchmarks.ports import free_port
 from benchmarks.server import cpu_s
 from benchmarks.server import serving as shipped_service
 from tests.service_parts import NAME, app_for, mask_parts, running
@@ -28,12 +28,6 @@ sys.exit(main(sys.argv[1:], lambda settings: ModelRegistry({"ellipsoid": ellipso
 
 def command(*words):
     return [sys.executable, "-c", PROGRAM, *map(str, words)]
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @contextmanager
