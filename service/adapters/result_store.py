@@ -5,13 +5,14 @@ one. Deleting renames first as well. Expired results are never served, even befo
 """
 
 import errno
+import os
 import re
 import shutil
 import threading
 import time
 import uuid
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -23,6 +24,8 @@ _IDENTIFIER = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}\Z")
 _TEMPORARY = ".tmp-"
 #: A temporary folder older than this (s) belongs to a program that is gone.
 _ABANDONED_AFTER_S = 3600.0
+#: How often (s) the folder is looked through for results that other processes keep there.
+_LOOK_AGAIN_S = 1.0
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -32,7 +35,8 @@ class DiskResultStore:
     Args:
         folder: made when it is not there, readable by its owner alone.
         lifetime_s: how long a result is served.
-        max_bytes: size of all results together; the oldest make room for a new one.
+        max_bytes: size of all results together; the oldest make room for a new one. Other processes may keep results
+            in the same folder; what they added within the last second may not be counted yet.
         clock: seconds since 1970.
     """
 
@@ -45,7 +49,8 @@ class DiskResultStore:
         self._max_bytes = max_bytes
         self._clock = clock
         self._lock = threading.Lock()
-        self._sizes: dict[Path, int] = {}
+        self._sizes: dict[str, int] = {}
+        self._looked_at = float("-inf")
 
     def save(self, outcome: Outcome, identifier: str | None = None) -> StoredResult:
         """Keep an outcome; `StoreFull` when it alone is larger than the store."""
@@ -56,10 +61,11 @@ class DiskResultStore:
             times = {"created": now, "expires": now + self._lifetime_s}
             write_outcome(temporary, outcome, times)
             with self._lock:
-                self._remove(self._folder / identifier)
-                self._sizes.pop(self._folder / identifier, None)
-                self._make_room(_size(temporary))
+                self._remove(identifier)
+                size = _size(temporary)
+                self._make_room(size)
                 temporary.rename(self._folder / identifier)
+                self._sizes[identifier] = size
         except BaseException as fault:
             shutil.rmtree(temporary, ignore_errors=True)
             if isinstance(fault, OSError) and fault.errno in _NO_ROOM:
@@ -84,26 +90,27 @@ class DiskResultStore:
         folder = self._path(identifier)
         with self._lock:
             expired = self._expiry(folder) <= self._clock()
-            if not self._remove(folder) or expired:
+            if not self._remove(identifier) or expired:
                 raise _unknown()
 
     def sweep(self) -> int:
         """Remove expired, damaged and half-written results; how many."""
         now = self._clock()
         with self._lock:
-            gone = [folder for folder in self._results() if self._expiry(folder) <= now]
+            gone = [name for name in self._results() if self._expiry(self._folder / name) <= now]
             for leftover in self._folder.glob(f"{_TEMPORARY}*"):
                 if _modified(leftover) < now - _ABANDONED_AFTER_S:
                     shutil.rmtree(leftover, ignore_errors=True)
-            return sum(self._remove(folder) for folder in gone)
+            return sum(self._remove(name) for name in gone)
 
     def _path(self, identifier: str) -> Path:
         if not _IDENTIFIER.match(identifier):
             raise _unknown()
         return self._folder / identifier
 
-    def _results(self) -> Iterator[Path]:
-        return (folder for folder in self._folder.iterdir() if _IDENTIFIER.match(folder.name))
+    def _results(self) -> list[str]:
+        with os.scandir(self._folder) as entries:
+            return [entry.name for entry in entries if _IDENTIFIER.match(entry.name)]
 
     def _expiry(self, folder: Path) -> float:
         try:
@@ -114,21 +121,24 @@ class DiskResultStore:
     def _make_room(self, needed: int) -> None:
         if needed > self._max_bytes:
             raise StoreFull("The result is larger than all results that this service may keep together.")
-        # What is kept does not change, so a folder's size is read once; other processes keep results here as well.
-        self._sizes = {folder: self._sizes.get(folder) or _size(folder) for folder in self._results()}
-        total = sum(self._sizes.values()) + needed
-        if total <= self._max_bytes:
+        now = time.monotonic()
+        if now < self._looked_at + _LOOK_AGAIN_S and sum(self._sizes.values()) + needed <= self._max_bytes:
             return
-        for folder in sorted(self._sizes, key=self._expiry):
-            self._remove(folder)
-            total -= self._sizes[folder]
-            if total <= self._max_bytes:
+        # What is kept does not change, so that a folder's size is read once.
+        self._sizes = {name: self._sizes.get(name) or _size(self._folder / name) for name in self._results()}
+        self._looked_at = now
+        left = self._max_bytes - needed - sum(self._sizes.values())
+        for name in sorted(self._sizes, key=lambda name: self._expiry(self._folder / name)) if left < 0 else ():
+            left += self._sizes[name]
+            self._remove(name)
+            if left >= 0:
                 return
 
-    def _remove(self, folder: Path) -> bool:
-        grave = folder.with_name(f"{_TEMPORARY}{uuid.uuid4()}")
+    def _remove(self, name: str) -> bool:
+        grave = self._folder / f"{_TEMPORARY}{uuid.uuid4()}"
+        self._sizes.pop(name, None)
         try:
-            folder.rename(grave)
+            (self._folder / name).rename(grave)
         except OSError:
             return False
         shutil.rmtree(grave, ignore_errors=True)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import stat
+import time
 
 import numpy as np
 import pytest
@@ -139,6 +140,23 @@ def test_the_oldest_make_room_for_the_new(tmp_path, clock):
     with pytest.raises(UnknownResult):
         store.load(kept[0])
     assert [store.load(identifier).id for identifier in kept[1:]] == kept[1:]
+
+
+def test_results_of_other_processes_make_room_too(tmp_path, clock, monkeypatch):
+    mine, theirs = (DiskResultStore(tmp_path, lifetime_s=100.0, max_bytes=10**9, clock=clock) for _ in range(2))
+    first = mine.save(outcome_of()).id
+    size = sum(file.stat().st_size for file in (tmp_path / first).iterdir())
+    monkeypatch.setattr(mine, "_max_bytes", int(2.5 * size))
+    for _ in range(2):
+        clock.now += 1.0
+        theirs.save(outcome_of())
+    begun = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: begun + 1.0)
+    clock.now += 1.0
+    mine.save(outcome_of())
+    assert len(list(tmp_path.iterdir())) == 2
+    with pytest.raises(UnknownResult):
+        theirs.load(first)
 
 
 def test_a_result_larger_than_the_store_is_refused_and_leaves_nothing(tmp_path, clock):
