@@ -13,6 +13,7 @@ import time
 import uuid
 import zipfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -27,6 +28,14 @@ _ABANDONED_AFTER_S = 3600.0
 #: How often (s) the folder is looked through for results that other processes keep there.
 _LOOK_AGAIN_S = 1.0
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """Size (bytes) of a result, and until when it is served (seconds since 1970)."""
+
+    size: int
+    expires: float
 
 
 class DiskResultStore:
@@ -49,7 +58,7 @@ class DiskResultStore:
         self._max_bytes = max_bytes
         self._clock = clock
         self._lock = threading.Lock()
-        self._sizes: dict[str, int] = {}
+        self._kept: dict[str, _Kept] = {}
         self._looked_at = float("-inf")
 
     def save(self, outcome: Outcome, identifier: str | None = None) -> StoredResult:
@@ -62,10 +71,10 @@ class DiskResultStore:
             write_outcome(temporary, outcome, times)
             with self._lock:
                 self._remove(identifier)
-                size = _size(temporary)
-                self._make_room(size)
+                kept = _Kept(_size(temporary), times["expires"])
+                self._make_room(kept.size)
                 temporary.rename(self._folder / identifier)
-                self._sizes[identifier] = size
+                self._kept[identifier] = kept
         except BaseException as fault:
             shutil.rmtree(temporary, ignore_errors=True)
             if isinstance(fault, OSError) and fault.errno in _NO_ROOM:
@@ -122,21 +131,19 @@ class DiskResultStore:
         if needed > self._max_bytes:
             raise StoreFull("The result is larger than all results that this service may keep together.")
         now = time.monotonic()
-        if now < self._looked_at + _LOOK_AGAIN_S and sum(self._sizes.values()) + needed <= self._max_bytes:
-            return
-        # What is kept does not change, so that a folder's size is read once.
-        self._sizes = {name: self._sizes.get(name) or _size(self._folder / name) for name in self._results()}
-        self._looked_at = now
-        left = self._max_bytes - needed - sum(self._sizes.values())
-        for name in sorted(self._sizes, key=lambda name: self._expiry(self._folder / name)) if left < 0 else ():
-            left += self._sizes[name]
-            self._remove(name)
-            if left >= 0:
-                return
+        if now >= self._looked_at + _LOOK_AGAIN_S:
+            # What is kept does not change, so that each folder is read once.
+            self._kept = {name: self._kept.get(name) or self._read(name) for name in self._results()}
+            self._looked_at = now
+        while self._kept and sum(kept.size for kept in self._kept.values()) + needed > self._max_bytes:
+            self._remove(min(self._kept, key=lambda name: self._kept[name].expires))
+
+    def _read(self, name: str) -> "_Kept":
+        return _Kept(_size(self._folder / name), self._expiry(self._folder / name))
 
     def _remove(self, name: str) -> bool:
         grave = self._folder / f"{_TEMPORARY}{uuid.uuid4()}"
-        self._sizes.pop(name, None)
+        self._kept.pop(name, None)
         try:
             (self._folder / name).rename(grave)
         except OSError:
