@@ -59,10 +59,12 @@ def generated(
     """Draw from a model and measure; draws without a surface are left out.
 
     Args:
-        samples: how many.
+        samples: how many; none are accepted.
         seed: of the draws.
         watch: called after each with its number.
     """
+    if samples == 0:
+        return Generation(np.zeros(0), np.zeros(0))
     sigmas, codes = np.asarray(model.manifest.sigmas), model.population.base_codes
     bases = sigmas * np.random.default_rng(seed).standard_normal((samples, len(sigmas)))
     latents = model.prior.from_base(bases)

@@ -180,6 +180,15 @@ class TestSweep:
         (one,) = read_results(tmp_path / "out")
         assert (one.prior, one.regime, len(one.measured["thin"])) == ("flow-ard", "thin", 1)
 
+    def test_no_shapes_need_to_be_generated(self, swept, masks, tmp_path):
+        folder, _, _ = swept
+        (bundle,) = (folder / "cells").glob("*-flow-ard-*/bundle")
+        words = ("sweep", "--masks", masks, "--bundle", bundle, "--samples", 0, "--limit", 1, "--jobs", 1)
+        answer = call(*words, "--output", tmp_path / "out")
+        assert answer.exit_code == 0, answer.output
+        (one,) = read_results(tmp_path / "out")
+        assert one.latent == []
+
     def test_the_report_is_one_file_with_tables_and_panels(self, swept, tmp_path):
         folder, _, _ = swept
         answer = call("report", folder, "--output", tmp_path / "page.html", "--command", "made <here>")
