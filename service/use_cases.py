@@ -103,7 +103,7 @@ def surface_sd(outcome: Outcome) -> Float[np.ndarray, "v"]:
 
 
 def annotated_planes(stacks: tuple[MaskStack, ...], rule: AnnotatedRule | Sequence[Plane]) -> tuple[Plane, ...]:
-    """The planes that `reconstruct` would use; errors as there."""
+    """The planes that `reconstruct` would use; errors as there, but that no model says how large the object may be."""
     return find_planes(stacks, rule)
 
 

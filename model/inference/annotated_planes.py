@@ -13,15 +13,17 @@ from model.inference.plane_cover import cover_planes
 
 AnnotatedRule = Literal["auto", "all", "nonempty"]
 
-#: Boxes around the foreground of two stacks may lie this far apart (mm).
-WORLD_GAP_MM = 20.0
+#: Boxes around the foreground of two stacks may lie this far apart (mm) where nothing is known of the object's size.
+WORLD_GAP_MM = 200.0
 #: Spacings that differ by less than this share are equal.
 SPACING_TOLERANCE = 1e-3
 #: Fewest planes from which a shape can be reconstructed.
 FEWEST_PLANES = 2
 
 
-def find_planes(stacks: Sequence[MaskStack], rule: AnnotatedRule | Sequence[Plane]) -> tuple[Plane, ...]:
+def find_planes(
+    stacks: Sequence[MaskStack], rule: AnnotatedRule | Sequence[Plane], gap_mm: float = WORLD_GAP_MM
+) -> tuple[Plane, ...]:
     """The annotated planes by a rule of the interface, or those named, checked against the stacks.
 
     ``all`` takes every plane along the axis of the largest spacing, ``nonempty`` those of them that hold
@@ -30,15 +32,19 @@ def find_planes(stacks: Sequence[MaskStack], rule: AnnotatedRule | Sequence[Plan
     Planes without foreground are annotated by ``all`` and by name only: between two drawn slices of a
     sparse stack nobody has looked.
 
+    Args:
+        gap_mm: how far from all others the foreground of a stack may lie: two ends of one object can be a whole
+            object apart.
+
     Returns:
         the planes in ascending order, each once.
 
     Raises:
         InvalidMask: fewer than two planes, or no foreground on them.
         InvalidParameter: a named plane that its stack does not have, or fewer than two named.
-        InconsistentStacks: the foreground of some stacks over `WORLD_GAP_MM` from that of all others.
+        InconsistentStacks: the foreground of some stacks over `gap_mm` from that of all others.
     """
-    _check_same_world(stacks)
+    _check_same_world(stacks, gap_mm)
     if isinstance(rule, str):
         planes = tuple(
             Plane(number, axis, index)
@@ -99,16 +105,16 @@ def _named_planes(stacks: Sequence[MaskStack], named: Sequence[Plane]) -> tuple[
     return planes
 
 
-def _check_same_world(stacks: Sequence[MaskStack]) -> None:
+def _check_same_world(stacks: Sequence[MaskStack], gap_mm: float) -> None:
     """Every stack must be near another, and through such neighbours near all: many series may hold a slice each."""
     boxes = [world_box(stack.grid, *index_box(stack.foreground)) for stack in stacks]
     reached, left = [0], list(range(1, len(stacks)))
     while left:
         gap, first, second = min((_gap(boxes[a], boxes[b]), a, b) for a in reached for b in left)
-        if gap > WORLD_GAP_MM:
+        if gap > gap_mm:
             raise InconsistentStacks(
-                f"{stacks[first].part} and {stacks[second].part} lie over {WORLD_GAP_MM:g} mm apart in the world; "
-                "stacks of one object in one frame are accepted",
+                f"{stacks[first].part} and {stacks[second].part} lie {gap:.0f} mm apart in the world, too far for one "
+                "object; stacks of one object in one frame are accepted",
                 part=stacks[second].part,
             )
         reached.append(second)

@@ -114,6 +114,11 @@ class Reconstruction:
     warnings: tuple[str, ...]
 
 
+def farthest_mm(model: ShapeModel) -> float:
+    """How far apart (mm) two sections of one object may lie: the longest side of the model's box."""
+    return 2.0 * max(model.manifest.half_extent_mm)
+
+
 def reconstruct(
     model: ShapeModel, stacks: Sequence[MaskStack], options: Options, watch: Watch = lambda stage: None
 ) -> Reconstruction:
@@ -126,7 +131,7 @@ def reconstruct(
     """
     _check(options)
     watch("observations")
-    planes = find_planes(stacks, options.annotated)
+    planes = find_planes(stacks, options.annotated, farthest_mm(model))
     drawing = observe(stacks, planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=options.seed)
     watch("fit")
     usual = discrepancy_prior(model.manifest)

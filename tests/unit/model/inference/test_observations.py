@@ -197,10 +197,10 @@ def test_stacks_must_lie_in_one_place(gap, axis):
     origin[axis] = gap + held(solid, axis)[-1] - held(solid, axis)[0]
     stacks = [stack_of(solid), stack_of(solid, origin=origin, part="mask[1]")]
     if gap <= 20.0:
-        assert len(find_planes(stacks, "auto")) == 4
+        assert len(find_planes(stacks, "auto", 20.0)) == 4
         return
     with pytest.raises(InconsistentStacks, match=r"mask\[0\] and mask\[1\]") as caught:
-        find_planes(stacks, "auto")
+        find_planes(stacks, "auto", 20.0)
     assert caught.value.part == "mask[1]"
 
 
@@ -208,11 +208,10 @@ def test_stacks_must_lie_in_one_place(gap, axis):
 def test_stacks_may_be_near_each_other_through_others(order):
     solid = cut(ellipsoid(), [(2, 12)])
     parts = [stack_of(solid, origin=(0.0, 0.0, 15.0 * place), part=f"mask[{n}]") for n, place in enumerate(order)]
-    assert len(find_planes(parts, [Plane(number, 2, 12) for number in range(3)])) == 3
+    ends = [part for part, place in zip(parts, order, strict=True) if place != 1]
+    assert len(find_planes(parts, [Plane(number, 2, 12) for number in range(3)], 20.0)) == 3
     with pytest.raises(InconsistentStacks):
-        find_planes(
-            [part for part, place in zip(parts, order, strict=True) if place != 1], [Plane(0, 2, 12), Plane(1, 2, 12)]
-        )
+        find_planes(ends, [Plane(0, 2, 12), Plane(1, 2, 12)], 20.0)
 
 
 # observations

@@ -194,6 +194,17 @@ def test_two_stacks_are_one_object():
     assert volume_ml(answer.mesh) == pytest.approx(ELLIPSOID.volume_ml, rel=0.12)
 
 
+def test_both_ends_of_an_object_are_one_object_however_long_it_is():
+    middle = ORTHOGONAL[0].index
+    ends = [
+        replace(drawn(ELLIPSOID, cube_around(CENTRE), [plane]), part=f"mask[{number}]")
+        for number, plane in enumerate((Plane(0, 0, middle - 11), Plane(0, 0, middle + 11)))
+    ]
+    answer = reconstruct(MODEL, ends, Options())
+    assert {plane.stack for plane in answer.planes} == {0, 1}
+    assert volume_ml(answer.mesh) == pytest.approx(ELLIPSOID.volume_ml, rel=0.25)
+
+
 @pytest.mark.parametrize("resolution", [0.0, -1.0, 0.2, 10.1, float("nan"), float("inf")])
 def test_resolution_out_of_range_is_refused(resolution):
     with pytest.raises(InvalidParameter, match=r"0\.25 to 10 mm is accepted") as caught:
