@@ -27,19 +27,22 @@ class Codes:
     Attributes:
         mean, deviation: (m, d); points have no deviation.
         group: (m,) codes of one group, a shape and its mirror image, are held out together.
+        axes: (d, d) rows along which the deviations lie; along the coordinates when None.
     """
 
     mean: Float[Tensor, "m d"]
     deviation: Float[Tensor, "m d"]
     group: Int[Tensor, "m"]
+    axes: Float[Tensor, "d d"] | None = None
 
     def of(self, chosen: Tensor) -> "Codes":
         """The chosen codes."""
-        return Codes(self.mean[chosen], self.deviation[chosen], self.group[chosen])
+        return Codes(self.mean[chosen], self.deviation[chosen], self.group[chosen], self.axes)
 
     def draw(self, generator: torch.Generator) -> Float[Tensor, "m d"]:
         """One draw of each."""
-        return self.mean + self.deviation * torch.randn(self.mean.shape, generator=generator)
+        apart = self.deviation * torch.randn(self.mean.shape, generator=generator)
+        return self.mean + (apart if self.axes is None else apart @ self.axes)
 
 
 def fitted_prior(prior: LatentPrior, codes: Codes, seed: int = 0) -> tuple[LatentPrior, float]:

@@ -5,9 +5,11 @@ divergence of the posterior from the prior along it, averaged over the training 
 at its mean goes into biases, so the field of the pruned decoder is that of the whole one with dead dimensions at their
 mean. The flow is autoregressive: dead dimensions enter the conditioners of live ones as their mean too, transform
 after transform. Between transforms a dead dimension may follow live ones a little; `Pruned.base_change` measures what
-that alters. `refitted` then fits the flow anew to the codes of the live dimensions alone.
+that alters. `refitted` then turns the live dimensions to the principal movements of the surface (`training.principal`)
+and fits the flow anew to the codes in these coordinates.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +23,7 @@ from model.networks.flow import MaskedLinear, SplineTransform
 from model.networks.prior import LatentPrior
 from model.networks.splines import parameter_count
 from training.autodecoder import AutoDecoder
+from training.principal import principal_axes, turned_decoder
 from training.prior_fit import Codes, fitted_prior
 
 #: A dimension whose divergence is below this (nats a training shape) is dead.
@@ -38,7 +41,9 @@ class Pruned:
         codes: (m, k) training codes.
         nats: (d,) divergence of each dimension of the whole code; NaN where codes are points.
         base_change: largest change of a live base coordinate of a training code, in sigmas, with the flow as it was.
+        trained_sigmas: (d,) of the whole prior.
         flow_gain: what the flow that was fitted anew adds to the log density of held-out codes (nats); None before.
+        principal: whether coordinates are those of `training.principal`.
     """
 
     decoder: OccupancyDecoder
@@ -47,7 +52,9 @@ class Pruned:
     codes: Float[Tensor, "m k"]
     nats: Float[np.ndarray, "d"]
     base_change: float
+    trained_sigmas: Float[np.ndarray, "d"]
     flow_gain: float | None = None
+    principal: bool = False
 
     def facts(self) -> dict[str, object]:
         """What the manifest says of it."""
@@ -59,6 +66,8 @@ class Pruned:
             else f"standard deviation of the codes at least {LEAST_SHARE:g} of the largest",
             "nats": [None if np.isnan(value) else float(value) for value in self.nats],
             "largest_base_change_in_sigmas": self.base_change,
+            "trained_sigmas": self.trained_sigmas.tolist(),
+            "principal": self.principal,
             "flow_gain_nats": self.flow_gain,
         }
 
@@ -80,22 +89,28 @@ def pruned(module: AutoDecoder) -> Pruned:
     prior = pruned_prior(module.prior, kept, centre)
     whole = module.prior.to_base(codes)[0][:, kept] / module.prior.sigma[kept]
     change = (prior.to_base(codes[:, kept])[0] / prior.sigma - whole).abs().max()
-    return Pruned(decoder.eval(), prior.eval(), kept.numpy(), codes[:, kept], nats, float(change))
+    sigmas = np.asarray(module.prior.sigma.numpy(), float)
+    return Pruned(decoder.eval(), prior.eval(), kept.numpy(), codes[:, kept], nats, float(change), sigmas)
 
 
-def refitted(less: Pruned, module: AutoDecoder, shapes: int) -> Pruned:
-    """The same with a flow fitted anew to the live dimensions, where codes are Gaussians.
+def refitted(less: Pruned, module: AutoDecoder, shapes: int, half_extent_mm: Sequence[float]) -> Pruned:
+    """The same in principal coordinates, with a flow fitted anew to the codes there, where codes are Gaussians.
 
     Args:
         shapes: number of training shapes; codes beyond are those of their mirror images, in the same order.
+        half_extent_mm: half sides of the box that holds all surfaces.
     """
     if not module.random:
         return less
     with torch.no_grad():
         everyone = torch.arange(len(less.codes))
         deviation = module.log_deviations(everyone)[:, torch.from_numpy(less.live)].exp()
-    prior, gain = fitted_prior(less.prior, Codes(less.codes, deviation, everyone % shapes))
-    return replace(less, prior=prior, flow_gain=gain)
+        axes = principal_axes(less.decoder, less.codes, deviation, half_extent_mm)
+        decoder, codes = turned_decoder(less.decoder, axes), axes.of(less.codes)
+        start = LatentPrior(less.prior.shape)
+        start.log_sigma.copy_(axes.sigma.log())
+    prior, gain = fitted_prior(start, Codes(codes, deviation, everyone % shapes, axes.axes))
+    return replace(less, decoder=decoder.eval(), prior=prior, codes=codes, flow_gain=gain, principal=True)
 
 
 @torch.no_grad()

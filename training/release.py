@@ -54,7 +54,7 @@ def export_run(
     if output.exists() and any(output.iterdir()):
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
     output.mkdir(parents=True, exist_ok=True)
-    less = refitted(pruned(module), module, len(record["train"])) if prune else None
+    less = refitted(pruned(module), module, len(record["train"]), record["half_extent_mm"]) if prune else None
     decoder, prior = (module.decoder, module.prior) if less is None else (less.decoder, less.prior)
     with _quiet_exporter():
         files = export_graphs(decoder, prior, output)

@@ -2,9 +2,11 @@
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from model.bundle import Manifest, ShapeModel, open_bundle, read_manifest
 from model.errors import InvalidParameter
@@ -22,7 +24,7 @@ from training.cohorts.cohort import Cohort
 from training.config import Regime, TrainingConfig
 from training.evaluate import Method, fills_of, measure
 from training.generation import SAMPLES, generated
-from training.release import export_run
+from training.release import active_dimensions, export_run
 from training.runs import CHECKPOINT, train_cohort
 from training.sparsify import for_evaluation
 from training.sweep.plan import Cell
@@ -111,6 +113,7 @@ def result_of(cell: Cell, model: ShapeModel, cohort: Cohort, effort: Effort, sec
         raise InvalidParameter(
             "The cohort has no test shapes; one with a test split, or --test-fraction, is accepted.", part="cohort"
         )
+    trained = trained_sigmas(model.manifest)
     drawn = generated(model, samples=effort.samples, watch=lambda number: watch("generating", number, effort.samples))
     return Result(
         key=cell.key,
@@ -126,8 +129,8 @@ def result_of(cell: Cell, model: ShapeModel, cohort: Cohort, effort: Effort, sec
         shapes=len(cohort.train),
         steps=steps_of(model.manifest),
         seconds=round(seconds, 1),
-        sigmas=sorted(model.manifest.sigmas, reverse=True),
-        active=list(model.manifest.active_dimensions),
+        sigmas=sorted(trained, reverse=True),
+        active=list(active_dimensions(np.array(trained))),
         latent=drawn.latent.round(4).tolist(),
         surface_mm=drawn.surface_mm.round(4).tolist(),
         measured={regime: _measured(model, cohort, regime, effort, watch) for regime in cell.measured_in},
@@ -138,6 +141,13 @@ def steps_of(manifest: Manifest) -> int:
     """Steps that the configuration in a manifest asks for."""
     config = manifest.training["config"]
     return int(config["steps"]) if isinstance(config, dict) else 0
+
+
+def trained_sigmas(manifest: Manifest) -> list[float]:
+    """Sigmas of all dimensions that were trained, dead ones among them."""
+    pruned = manifest.training.get("pruned")
+    known = pruned.get("trained_sigmas") if isinstance(pruned, Mapping) else None
+    return list(manifest.sigmas if known is None else known)
 
 
 def adopt(bundle: Path, folder: Path) -> None:
@@ -157,7 +167,7 @@ def _train(cohort: Cohort, config: TrainingConfig, run: Path, watch: Watch) -> N
 def _export(run: Path, bundle: Path, cohort: Cohort, effort: Effort) -> None:
     part = bundle.with_name(f"{bundle.name}.part")
     shutil.rmtree(part, ignore_errors=True)
-    export_run(run, part)
+    export_run(run, part, prune=True)
     if effort.calibrate and cohort.validation:
         calibrate_bundle(part, cohort, threads=1)
     part.rename(bundle)

@@ -1,0 +1,88 @@
+"""Principal coordinates: another description of the same fields, in which sigmas and distances are in mm."""
+
+import pytest
+import torch
+
+from model.networks.decoder import DecoderShape, OccupancyDecoder
+from training.principal import principal_axes, surface_metric, turned_decoder
+
+SIZE, SHAPES = 5, 40
+HALF_MM = (20.0, 18.0, 16.0)
+
+
+def decoder_of(seed):
+    """Balls around the origin that every dimension of the code dents in its own way."""
+    torch.manual_seed(seed)
+    decoder = OccupancyDecoder(DecoderShape(latent_size=SIZE, width=24, depth=3, extent_mm=20.0)).double()
+    optimiser = torch.optim.Adam(decoder.parameters(), 1e-2)
+    for _ in range(300):
+        points, codes = 40.0 * torch.rand(4, 256, 3).double() - 20.0, torch.randn(4, SIZE).double()
+        radius = 10.0 + codes @ torch.linspace(1.0, 0.1, SIZE).double()
+        loss = (decoder(codes, points) - (radius[:, None] - points.norm(dim=-1))).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    return decoder.float().eval()
+
+
+@pytest.fixture(scope="module", params=range(2))
+def parts(request):
+    """A decoder, codes with deviations, and their axes."""
+    decoder = decoder_of(request.param)
+    codes = torch.randn(SHAPES, SIZE) @ torch.randn(SIZE, SIZE) * 0.4 + 0.2
+    deviation = 0.1 + 0.1 * torch.rand(SHAPES, SIZE)
+    return decoder, codes, deviation, principal_axes(decoder, codes, deviation, HALF_MM)
+
+
+@torch.no_grad()
+def test_the_field_stays(parts):
+    decoder, codes, _, axes = parts
+    points = 20.0 * torch.randn(SHAPES, 50, 3)
+    torch.testing.assert_close(
+        turned_decoder(decoder, axes)(axes.of(codes), points), decoder(codes, points), atol=2e-3, rtol=1e-3
+    )
+
+
+@torch.no_grad()
+def test_coordinates_are_uncorrelated_and_sigmas_theirs(parts):
+    _, codes, deviation, axes = parts
+    new = axes.of(codes)
+    spread = axes.axes.T @ torch.diag(deviation.square().mean(dim=0)) @ axes.axes
+    covariance = torch.cov(new.T, correction=0) + spread
+    torch.testing.assert_close(covariance, torch.diag(axes.sigma.square()), atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(new.mean(dim=0), torch.zeros(SIZE), atol=1e-4, rtol=0.0)
+    assert (axes.sigma.diff() <= 0).all()
+
+
+@torch.no_grad()
+def test_a_step_is_as_long_as_the_surface_moves(parts):
+    decoder, codes, _, axes = parts
+    turned, new = turned_decoder(decoder, axes), axes.of(codes)
+    torch.testing.assert_close(surface_metric(turned, new, HALF_MM).float(), torch.eye(SIZE), atol=0.02, rtol=0.0)
+
+
+@torch.no_grad()
+def test_movements_are_those_of_the_surface(parts):
+    """A small step of the code against the distance at which the surface is found again along its normals."""
+    decoder, codes, _, _ = parts
+    code, step = codes[:1], 1e-3 * torch.randn(1, SIZE)
+    points = on_surface(decoder, code, 10.0 * torch.nn.functional.normalize(torch.randn(1, 4000, 3), dim=-1))
+    _, by_latent, by_point = decoder.jacobians(code, points)
+    slope = by_point.norm(dim=-1)
+    first_order = (by_latent @ step[0]) / slope
+    moved = on_surface(decoder, code + step, points)
+    along = ((moved - points) * -by_point).sum(dim=-1) / slope
+    torch.testing.assert_close(along, first_order, atol=2e-4, rtol=0.05)
+
+
+def on_surface(decoder, code, points):
+    """Points carried to the iso-level along the gradient."""
+    for _ in range(8):
+        logits, _, by_point = decoder.jacobians(code, points)
+        points = points - (logits / by_point.square().sum(dim=-1))[..., None] * by_point
+    return points
+
+
+def test_the_same_codes_give_the_same_axes(parts):
+    decoder, codes, deviation, axes = parts
+    assert torch.equal(principal_axes(decoder, codes, deviation, HALF_MM).axes, axes.axes)
