@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from statistics import median
 
 import numpy as np
-from jaxtyping import Float
 from scipy.stats import ks_2samp
 
 from benchmarks.generator.density import FittedCase, GaussianPrior, fitted, log_densities
@@ -40,21 +39,14 @@ class Plan:
     seed: int = 0
 
 
-@dataclass(frozen=True)
-class Draws:
-    """Draws of the prior, none rejected: base codes over sigma, and surfaces (None where there is none)."""
-
-    base: Float[np.ndarray, "n d"]
-    surfaces: list[Surface | None]
-
-    def present(self) -> list[Surface]:
-        """Those with a surface."""
-        return [surface for surface in self.surfaces if surface is not None]
+#: Surfaces of draws of the prior, none rejected; None where there is none.
+Draws = Sequence[Surface | None]
 
 
 def measured(model: ShapeModel, cohort: Cohort, held_out: Sequence[Case], plan: Plan) -> Iterator[list[Figure]]:
     """All figures, part by part."""
     draws = draw_all(model, plan)
+    present = [surface for surface in draws if surface is not None]
     training = [decoded(model, code, plan.spacing_mm) for code in model.population.codes]
     masks = [surface_of_mask(case, mirrored=m) for case in cohort.train for m in _images(cohort)]
     modes = shape_modes(model)
@@ -66,17 +58,16 @@ def measured(model: ShapeModel, cohort: Cohort, held_out: Sequence[Case], plan: 
     trained = [fitted(model, case, plan.spacing_mm) for case in some]
     unseen = [fitted(model, case, plan.spacing_mm) for case in held_out[: plan.fitted]]
     yield _density(model, trained, unseen)
-    yield _against_principal(model, cohort, held_out[: plan.fitted], unseen, draws, masks, active[-1], plan)
-    yield _membership(cohort, draws, masks, training, held_out, plan)
+    yield _against_principal(model, cohort, held_out[: plan.fitted], unseen, present, masks, active[-1], plan)
+    yield _membership(cohort, present, masks, training, held_out, plan)
     yield _speed(model, plan)
 
 
 def draw_all(model: ShapeModel, plan: Plan) -> Draws:
     """Draws of consecutive seeds as the service makes them, without rejection."""
     sigmas = np.asarray(model.manifest.sigmas)
-    base = np.stack([np.random.default_rng(seed).standard_normal(len(sigmas)) for seed in range(plan.samples)])
-    surfaces = [decoded(model, model.prior.from_base((row * sigmas)[None])[0], plan.spacing_mm) for row in base]
-    return Draws(base, surfaces)
+    base = [sigmas * np.random.default_rng(seed).standard_normal(len(sigmas)) for seed in range(plan.samples)]
+    return [decoded(model, model.prior.from_base(row[None])[0], plan.spacing_mm) for row in base]
 
 
 def _compactness(model: ShapeModel, active: tuple[int, int, int]) -> list[Figure]:
@@ -93,11 +84,11 @@ def _compactness(model: ShapeModel, active: tuple[int, int, int]) -> list[Figure
 
 
 def _distributions(model: ShapeModel, draws: Draws, training: Sequence[Surface]) -> list[Figure]:
-    present = draws.present()
+    present = [surface for surface in draws if surface is not None]
     volumes = ks_2samp([s.volume_ml for s in present], [s.volume_ml for s in training])
     masks = ks_2samp([s.volume_ml for s in present], model.population.volumes_ml)
     areas = ks_2samp([s.area_cm2 for s in present], [s.area_cm2 for s in training])
-    whole = sum(surface.parts == 1 for surface in present) / len(draws.surfaces)
+    whole = sum(surface.parts == 1 for surface in present) / len(draws)
     return [
         Figure("volume: two-sample KS p", float(volumes.pvalue), "training codes' surfaces", limit=0.05, at_most=False),
         Figure("volume: the same against the masks", float(masks.pvalue), "coarse surfaces are smaller"),
@@ -133,7 +124,7 @@ def _against_principal(
     cohort: Cohort,
     held_out: Sequence[Case],
     unseen: Sequence[FittedCase],
-    draws: Draws,
+    draws: Sequence[Surface],
     masks: Sequence[Surface],
     count: int,
     plan: Plan,
@@ -147,7 +138,7 @@ def _against_principal(
     theirs = float(np.mean([distance_mm(s, t) for s, t in zip(described, truths, strict=True) if s is not None]))
     gaussian = GaussianPrior.of(np.asarray(model.population.codes, float)).draw(plan.compared, plan.seed)
     others = {
-        "model": draws.present()[: plan.compared],
+        "model": draws[: plan.compared],
         "principal": drawn(modes, plan.compared, plan.seed),
         "gaussian": [s for code in gaussian if (s := decoded(model, code, plan.spacing_mm)) is not None],
     }
@@ -164,7 +155,7 @@ def _against_principal(
 
 def _membership(
     cohort: Cohort,
-    draws: Draws,
+    draws: Sequence[Surface],
     masks: Sequence[Surface],
     training: Sequence[Surface | None],
     held_out: Sequence[Case],
@@ -175,7 +166,7 @@ def _membership(
     chosen = [i * images for i in _spread(len(masks) // images, plan.fitted)]
     known = [nearest_mm(masks[i], masks, leave_out=range(i, i + images)) for i in chosen]
     unseen = [nearest_mm(surface_of_mask(case), masks) for case in held_out]
-    made = [nearest_mm(surface, masks) for surface in draws.present()[: plan.compared]]
+    made = [nearest_mm(surface, masks) for surface in draws[: plan.compared]]
     own = [nearest_mm(s, masks) for i in _spread(len(training), plan.fitted) if (s := training[i]) is not None]
     copies = float(np.mean(np.array(made) <= np.quantile(own, 0.95)))
     return [
