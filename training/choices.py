@@ -62,8 +62,9 @@ def configured(
     reflected: bool,
     seed: int,
     device: DeviceName,
+    ard_weight: float | None = None,
 ) -> "TrainingConfig":
-    """The configuration that the options describe.
+    """The configuration that the options describe; the default weight of ARD when None.
 
     ``paper`` is the MorphoFlow paper as written: points as codes, soft Dice, a plain decoder, the flow on the codes
     themselves, batches of 6.
@@ -77,10 +78,12 @@ def configured(
     plain = TrainingConfig()
     prior = replace(PriorShape(FlowShape(latent_size=latent_size)), use_flow=flow, use_ard=ard, standardise=not paper)
     loss = (
-        ObjectiveConfig(name="paper", reconstruction="dice", ramp=0.0)
+        ObjectiveConfig(name="paper", reconstruction="dice", ramp=0.0, lambda_ard=1e-4)
         if paper
         else replace(plain.objective, name=objective.value)
     )
+    if ard_weight is not None:
+        loss = replace(loss, lambda_ard=ard_weight)
     return replace(
         plain,
         decoder=DecoderShape(latent_size=latent_size, unit_columns=not paper),

@@ -61,6 +61,9 @@ def train(
     epochs: Annotated[int | None, typer.Option(min=1, help="Passes over the cohort, in place of --steps.")] = None,
     flow: Annotated[bool, typer.Option("--flow/--no-flow", help="Whether the prior has a flow.")] = True,
     ard: Annotated[bool, typer.Option("--ard/--no-ard", help="Whether relevance is determined.")] = True,
+    ard_weight: Annotated[
+        float | None, typer.Option(min=0.0, help="Of relevance determination; more leaves fewer dimensions alive.")
+    ] = None,
     reflect: Annotated[
         bool | None,
         typer.Option(
@@ -83,7 +86,15 @@ def train(
         known = source.cohort is not None and found.reflects and objective is not ObjectiveName.PAPER
         paired = known if reflect is None else reflect
         config = configured(
-            objective, regime, latent_size, flow=flow, ard=ard, reflected=paired, seed=options.seed, device=device
+            objective,
+            regime,
+            latent_size,
+            flow=flow,
+            ard=ard,
+            reflected=paired,
+            seed=options.seed,
+            device=device,
+            ard_weight=ard_weight,
         )
         codes = (2 if paired else 1) * len(found.train)
         config = with_patience(with_duration(with_batches(config, codes), steps, epochs, codes), patience)

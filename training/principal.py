@@ -1,10 +1,10 @@
 """Latent coordinates along the principal movements of the surface.
 
 A latent code is known up to an affine change of coordinates, which decoder and prior absorb. It is chosen here so that
-coordinates are uncorrelated over the training codes and a step of the code is as long as the surface moves: the root
-mean square of the movement along the normal over the surface (mm), to first order, on average over training codes.
-Sigmas are then movements in mm, largest first, and distances between codes those between their surfaces, as far as the
-decoder bends little between them. It is to the decoder what principal component analysis is to a set of points.
+coordinates are uncorrelated over the training codes and a step of the code is as long as the surface moves: the mean
+distance along the normal over the surface (mm), to first order, on average over training codes. Sigmas are then
+movements in mm, largest first, and distances between codes are average surface distances, as far as the decoder bends
+little between them. It is to the decoder what principal component analysis is to a set of points.
 """
 
 from collections.abc import Sequence
@@ -20,6 +20,8 @@ from model.networks.decoder import OccupancyDecoder
 CODES, POINTS = 24, 1 << 14
 #: Points so near to the surface (mm, to first order) stand for it: uniform ones in a thin shell are uniform over area.
 SHELL_MM = 1.0
+#: Steps by which lengths are fitted: at least so many, and so many for each number that is sought.
+STEPS, STEPS_EACH = 4000, 4
 #: Movements below this share of the largest are taken for it, so that no coordinate is without length.
 LEAST_MOVEMENT = 1e-3
 
@@ -50,33 +52,49 @@ def principal_axes(
     half_extent_mm: Sequence[float],
 ) -> PrincipalAxes:
     """Axes of Gaussian codes: their means, standard deviations, and the box (mm) that holds their surfaces."""
-    centre = codes.mean(dim=0)
     covariance = torch.cov(codes.T, correction=0) + torch.diag(deviation.square().mean(dim=0))
-    values, vectors = torch.linalg.eigh(surface_metric(decoder, codes, half_extent_mm))
-    root = vectors * values.clamp(min=float(values.max()) * LEAST_MOVEMENT**2).sqrt()
-    variances, turn = torch.linalg.eigh(root.T @ covariance.double() @ root)
-    axes = (root @ turn).flip(1)
+    spread = torch.linalg.cholesky(covariance.double())
+    squares, turn = torch.linalg.eigh(
+        length_metric([found @ spread for found in movements(decoder, codes, half_extent_mm)])
+    )
+    sigma = squares.clamp(min=float(squares.max()) * LEAST_MOVEMENT**2).sqrt().flip(0)
+    axes = torch.linalg.solve_triangular(spread.T, turn.flip(1), upper=True) * sigma
     largest = axes.abs().argmax(dim=0)
     axes = axes * axes.gather(0, largest[None]).sign()
-    return PrincipalAxes(centre, axes.float(), variances.flip(0).clamp(min=1e-12).sqrt().float())
+    return PrincipalAxes(codes.mean(dim=0), axes.float(), sigma.float())
 
 
 @torch.no_grad()
-def surface_metric(
+def movements(
     decoder: OccupancyDecoder, codes: Float[Tensor, "m k"], half_extent_mm: Sequence[float]
-) -> Float[Tensor, "k k"]:
-    """Mean over surfaces, of some codes, of the outer product of the movement along the normal (mm) by the code."""
+) -> list[Float[Tensor, "_ k"]]:
+    """For some of the codes the movement (mm) of their surface's points along the normal by each coordinate."""
     generator = torch.Generator().manual_seed(0)
-    chosen = codes[torch.linspace(0, len(codes) - 1, min(CODES, len(codes))).round().long()]
-    movements = []
-    for code in chosen:
+    found = []
+    for code in codes[torch.linspace(0, len(codes) - 1, min(CODES, len(codes))).round().long()]:
         points = (2.0 * torch.rand(POINTS, 3, generator=generator) - 1.0) * torch.tensor(half_extent_mm)
         logits, by_latent, by_point = decoder.jacobians(code[None], points[None])
         slope = by_point[0].norm(dim=1).clamp(min=1e-6)
         near = logits[0].abs() < SHELL_MM * slope
-        movements.append(by_latent[0][near] / slope[near, None])
-    every = torch.cat(movements).double()
-    return every.T @ every / max(len(every), 1)
+        if near.any():
+            found.append((by_latent[0][near] / slope[near, None]).double())
+    return found
+
+
+@torch.no_grad()
+def length_metric(moved: Sequence[Float[Tensor, "_ k"]]) -> Float[Tensor, "k k"]:
+    """Least squares fit, in relative terms, of ``w^T M w`` to the squared mean movement by standard normal steps w."""
+    size = moved[0].shape[1]
+    rows, columns = torch.triu_indices(size, size)
+    count = max(STEPS, STEPS_EACH * len(rows))
+    steps = torch.randn(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    squares = torch.stack([(found @ steps.T).abs().mean(dim=0).square() for found in moved]).mean(dim=0)
+    squares = squares.clamp(min=float(squares.max()) * 1e-12)
+    products = steps[:, rows] * steps[:, columns] * torch.where(rows == columns, 1.0, 2.0)
+    numbers = torch.linalg.lstsq(products / squares[:, None], torch.ones(count, 1, dtype=torch.float64)).solution[:, 0]
+    metric = torch.zeros(size, size, dtype=torch.float64)
+    metric[rows, columns] = numbers
+    return metric + metric.T - torch.diag(metric.diag())
 
 
 @torch.no_grad()

@@ -132,9 +132,9 @@ class TestTrain:
 
 
 class TestConfiguration:
-    def build(self, objective=ObjectiveName.VARIATIONAL, flow=True, ard=True):
+    def build(self, objective=ObjectiveName.VARIATIONAL, flow=True, ard=True, **more):
         return configured(
-            objective, RegimeName.THICK, 16, flow=flow, ard=ard, reflected=True, seed=3, device=DeviceName.CPU
+            objective, RegimeName.THICK, 16, flow=flow, ard=ard, reflected=True, seed=3, device=DeviceName.CPU, **more
         )
 
     def test_options_reach_the_configuration(self):
@@ -143,6 +143,11 @@ class TestConfiguration:
         assert config.decoder.latent_size == config.prior.flow.latent_size == 16
         assert not config.prior.use_flow
         assert not config.prior.use_ard
+
+    @pytest.mark.parametrize("objective", list(ObjectiveName))
+    def test_the_weight_of_relevance_determination_is_a_choice(self, objective):
+        assert self.build(objective, ard_weight=7e-5).objective.lambda_ard == 7e-5
+        assert self.build(objective).objective.lambda_ard == (1e-4 if objective is ObjectiveName.PAPER else 3e-5)
 
     def test_the_paper_is_selectable_as_written(self):
         config = self.build(ObjectiveName.PAPER)
