@@ -27,13 +27,13 @@ class Codes:
     Attributes:
         mean, deviation: (m, d); points have no deviation.
         group: (m,) codes of one group, a shape and its mirror image, are held out together.
-        axes: (d, d) rows along which the deviations lie; along the coordinates when None.
+        axes: (e, d) rows along which the deviations, (m, e) then, lie; along the coordinates when None.
     """
 
     mean: Float[Tensor, "m d"]
-    deviation: Float[Tensor, "m d"]
+    deviation: Float[Tensor, "m e"]
     group: Int[Tensor, "m"]
-    axes: Float[Tensor, "d d"] | None = None
+    axes: Float[Tensor, "e d"] | None = None
 
     def of(self, chosen: Tensor) -> "Codes":
         """The chosen codes."""
@@ -41,7 +41,7 @@ class Codes:
 
     def draw(self, generator: torch.Generator) -> Float[Tensor, "m d"]:
         """One draw of each."""
-        apart = self.deviation * torch.randn(self.mean.shape, generator=generator)
+        apart = self.deviation * torch.randn(self.deviation.shape, generator=generator)
         return self.mean + (apart if self.axes is None else apart @ self.axes)
 
 

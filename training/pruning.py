@@ -6,7 +6,7 @@ at its mean goes into biases, so the field of the pruned decoder is that of the 
 mean. The flow is autoregressive: dead dimensions enter the conditioners of live ones as their mean too, transform
 after transform. Between transforms a dead dimension may follow live ones a little; `Pruned.base_change` measures what
 that alters. `refitted` then turns the live dimensions to the principal movements of the surface (`training.principal`)
-and fits the flow anew to the codes in these coordinates.
+and fits the flow anew to the codes in these coordinates; those that move next to nothing are left out as well.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ class Pruned:
 
     Attributes:
         live: numbers of these dimensions in the whole code.
-        codes: (m, k) training codes.
+        codes: (m, k) training codes; in principal coordinates there may be fewer of them than live dimensions.
         nats: (d,) divergence of each dimension of the whole code; NaN where codes are points.
         base_change: largest change of a live base coordinate of a training code, in sigmas, with the flow as it was.
         trained_sigmas: (d,) of the whole prior.
@@ -48,7 +48,7 @@ class Pruned:
 
     decoder: OccupancyDecoder
     prior: LatentPrior
-    live: Int[np.ndarray, "k"]
+    live: Int[np.ndarray, "n"]
     codes: Float[Tensor, "m k"]
     nats: Float[np.ndarray, "d"]
     base_change: float
@@ -106,10 +106,12 @@ def refitted(less: Pruned, module: AutoDecoder, shapes: int, half_extent_mm: Seq
         everyone = torch.arange(len(less.codes))
         deviation = module.log_deviations(everyone)[:, torch.from_numpy(less.live)].exp()
         axes = principal_axes(less.decoder, less.codes, deviation, half_extent_mm)
-        decoder, codes = turned_decoder(less.decoder, axes), axes.of(less.codes)
-        start = LatentPrior(less.prior.shape)
-        start.log_sigma.copy_(axes.sigma.log())
-    prior, gain = fitted_prior(start, Codes(codes, deviation, everyone % shapes, axes.axes))
+        moving = torch.arange(int((axes.sigma >= LEAST_SHARE * axes.sigma[0]).sum()))
+        decoder = pruned_decoder(turned_decoder(less.decoder, axes), moving, torch.zeros(len(axes.sigma)))
+        codes = axes.of(less.codes)[:, moving]
+        start = LatentPrior(replace(less.prior.shape, flow=replace(less.prior.shape.flow, latent_size=len(moving))))
+        start.log_sigma.copy_(axes.sigma[moving].log())
+    prior, gain = fitted_prior(start, Codes(codes, deviation, everyone % shapes, axes.axes[:, moving]))
     return replace(less, decoder=decoder.eval(), prior=prior, codes=codes, flow_gain=gain, principal=True)
 
 
