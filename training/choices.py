@@ -78,7 +78,7 @@ def configured(
     plain = TrainingConfig()
     prior = replace(PriorShape(FlowShape(latent_size=latent_size)), use_flow=flow, use_ard=ard, standardise=not paper)
     loss = (
-        ObjectiveConfig(name="paper", reconstruction="dice", ramp=0.0, lambda_ard=1e-4)
+        ObjectiveConfig(name="paper", reconstruction="dice", ramp=0.0)
         if paper
         else replace(plain.objective, name=objective.value)
     )

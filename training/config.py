@@ -32,7 +32,7 @@ class ObjectiveConfig:
     reconstruction: ReconstructionName = "bce"
     lambda_flow: float = 1e-3
     ramp: float = 0.3
-    lambda_ard: float = 3e-5
+    lambda_ard: float = 1e-4
     a: float = 2.0
     b: float = 1e-6
 

@@ -147,7 +147,7 @@ class TestConfiguration:
     @pytest.mark.parametrize("objective", list(ObjectiveName))
     def test_the_weight_of_relevance_determination_is_a_choice(self, objective):
         assert self.build(objective, ard_weight=7e-5).objective.lambda_ard == 7e-5
-        assert self.build(objective).objective.lambda_ard == (1e-4 if objective is ObjectiveName.PAPER else 3e-5)
+        assert self.build(objective).objective.lambda_ard == 1e-4
 
     def test_the_paper_is_selectable_as_written(self):
         config = self.build(ObjectiveName.PAPER)
