@@ -19,7 +19,8 @@ from model.networks.decoder import OccupancyDecoder
 #: Training codes at whose surfaces movements are measured, and points of the box that are tried for each.
 CODES, POINTS = 24, 1 << 14
 #: Points so near to the surface (mm, to first order) stand for it: uniform ones in a thin shell are uniform over area.
-SHELL_MM = 1.0
+#: Of a decoder so little trained that it has none there the nearest few do.
+SHELL_MM, FEWEST = 1.0, 64
 #: Steps by which lengths are fitted: at least so many, and so many for each number that is sought.
 STEPS, STEPS_EACH = 4000, 4
 #: Movements below this share of the largest are taken for it, so that no coordinate is without length.
@@ -75,9 +76,9 @@ def movements(
         points = (2.0 * torch.rand(POINTS, 3, generator=generator) - 1.0) * torch.tensor(half_extent_mm)
         logits, by_latent, by_point = decoder.jacobians(code[None], points[None])
         slope = by_point[0].norm(dim=1).clamp(min=1e-6)
-        near = logits[0].abs() < SHELL_MM * slope
-        if near.any():
-            found.append((by_latent[0][near] / slope[near, None]).double())
+        gap = logits[0].abs() / slope
+        near = gap <= max(SHELL_MM, float(gap.kthvalue(FEWEST).values))
+        found.append((by_latent[0][near] / slope[near, None]).double())
     return found
 
 

@@ -23,8 +23,8 @@ CANDIDATES = 12
 #: A face is measured at its corners, and between them at as many steps as make its samples as dense as twice the other
 #: mesh's faces, at least 2 and at most so many.
 MOST_STEPS = 8
-#: Faces that meet at a sharper angle than this (cosine) are taken for folded.
-SHARPEST = -0.5
+#: Faces that meet at a sharper angle than this (cosine), and than any faces did before, are taken for folded.
+SHARPEST, SHARPEST_EVER = -0.5, -0.98
 
 
 def decimated(mesh: Mesh, max_error_mm: float) -> Mesh:
@@ -42,24 +42,18 @@ def decimated(mesh: Mesh, max_error_mm: float) -> Mesh:
         raise InvalidParameter("The error of a decimation must be 0 mm or more.", part="max_error_mm")
     if mesh.is_empty or max_error_mm == 0:
         return mesh
-    best, low, high = mesh, 0, len(REDUCTIONS)
-    while low < high:
-        middle = (low + high) // 2
-        fewer = _reduced(mesh, REDUCTIONS[middle])
-        if _is_sound(fewer) and hausdorff_mm(mesh, fewer) <= max_error_mm:
-            best, low = fewer, middle + 1
-        else:
-            high = middle
-    return best
+    least = max(min(SHARPEST, _sharpest(mesh)), SHARPEST_EVER)
+    # A weaker reduction may be farther off than a stronger one, so that halving the list would pass some by.
+    for reduction in reversed(REDUCTIONS):
+        fewer = _reduced(mesh, reduction)
+        if is_watertight(fewer) and _sharpest(fewer) >= least and hausdorff_mm(mesh, fewer) <= max_error_mm:
+            return fewer
+    return mesh
 
 
 def _reduced(mesh: Mesh, reduction: float) -> Mesh:
     vertices, faces = fast_simplification.simplify(mesh.vertices, mesh.faces.astype(np.int32), reduction)
     return _with_scalars(mesh, np.asarray(vertices, float), np.asarray(faces, np.int64))
-
-
-def _is_sound(mesh: Mesh) -> bool:
-    return is_watertight(mesh) and not _is_folded(mesh)
 
 
 def hausdorff_mm(first: Mesh, second: Mesh) -> float:
@@ -104,16 +98,18 @@ def _samples(mesh: Mesh, steps: int) -> Float[np.ndarray, "n 3"]:
     return np.concatenate([mesh.vertices, between.reshape(-1, 3)])
 
 
-def _is_folded(mesh: Mesh) -> bool:
-    """Whether two faces with a common edge look in nearly opposite directions."""
+def _sharpest(mesh: Mesh) -> float:
+    """Cosine between the normals of the two neighbouring faces that look most apart; -1 where one has no area."""
     tri = mesh.vertices[mesh.faces]
     normals = np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0])
     length = np.linalg.norm(normals, axis=1)
     edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     order = np.lexsort(edges.T)
     owners = (np.arange(len(edges)) // 3)[order].reshape(-1, 2) if len(edges) % 2 == 0 else np.zeros((0, 2), int)
+    if (length == 0).any() or not len(owners):
+        return -1.0
     cosine = np.einsum("ij,ij->i", *(normals[owners[:, k]] for k in (0, 1)))
-    return bool((length == 0).any() or (cosine < SHARPEST * length[owners].prod(axis=1)).any())
+    return float((cosine / length[owners].prod(axis=1)).min())
 
 
 def _with_scalars(mesh: Mesh, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Mesh:
