@@ -28,6 +28,7 @@ from training.release import active_dimensions, export_run
 from training.runs import CHECKPOINT, train_cohort
 from training.sparsify import for_evaluation
 from training.sweep.plan import Cell
+from training.sweep.priors import PriorName
 from training.sweep.table import FIGURES, Result
 
 RUN, BUNDLE = "run", "bundle"
@@ -78,7 +79,7 @@ def run_cell(
     if not (bundle / "manifest.json").is_file():
         config = config_of(cell, cohort, effort, device, known=known)
         _train(cohort, config, folder / RUN, watch)
-        _export(folder / RUN, bundle, cohort, effort)
+        _export(folder / RUN, bundle, cohort, effort, prune=cell.prior is not PriorName.PLAIN)
     model = open_bundle(bundle, threads=1)
     return result_of(cell, model, cohort, effort, time.perf_counter() - begin, watch)
 
@@ -164,10 +165,10 @@ def _train(cohort: Cohort, config: TrainingConfig, run: Path, watch: Watch) -> N
     train_cohort(cohort, config, run, resume=resume, watch=lambda step, figures: watch("training", step, config.steps))
 
 
-def _export(run: Path, bundle: Path, cohort: Cohort, effort: Effort) -> None:
+def _export(run: Path, bundle: Path, cohort: Cohort, effort: Effort, *, prune: bool) -> None:
     part = bundle.with_name(f"{bundle.name}.part")
     shutil.rmtree(part, ignore_errors=True)
-    export_run(run, part, prune=True)
+    export_run(run, part, prune=prune)
     if effort.calibrate and cohort.validation:
         calibrate_bundle(part, cohort, threads=1)
     part.rename(bundle)

@@ -14,6 +14,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from model.bundle import read_manifest
 from model.errors import InvalidParameter
 from training.cli import register
 from training.cohorts import CohortOptions
@@ -171,23 +172,24 @@ class TestSweep:
         assert call(*words).exit_code == 0
         assert (folder / "results.jsonl").read_bytes() == before
 
-    def test_an_exported_model_is_a_cell_of_its_own(self, swept, masks, tmp_path):
+    @pytest.mark.parametrize("samples", [3, 0])
+    def test_an_exported_model_is_a_cell_of_its_own(self, swept, masks, tmp_path, samples):
         folder, _, _ = swept
         (bundle,) = (folder / "cells").glob("*-flow-ard-*/bundle")
-        words = ("sweep", "--masks", masks, "--bundle", bundle, "--samples", 3, "--limit", 1, "--jobs", 1)
+        words = ("sweep", "--masks", masks, "--bundle", bundle, "--samples", samples, "--limit", 1, "--jobs", 1)
         answer = call(*words, "--output", tmp_path / "out")
         assert answer.exit_code == 0, answer.output
         (one,) = read_results(tmp_path / "out")
         assert (one.prior, one.regime, len(one.measured["thin"])) == ("flow-ard", "thin", 1)
+        assert len(one.latent) <= samples
 
-    def test_no_shapes_need_to_be_generated(self, swept, masks, tmp_path):
+    def test_plain_cells_keep_their_prior_and_the_others_are_pruned(self, swept):
         folder, _, _ = swept
-        (bundle,) = (folder / "cells").glob("*-flow-ard-*/bundle")
-        words = ("sweep", "--masks", masks, "--bundle", bundle, "--samples", 0, "--limit", 1, "--jobs", 1)
-        answer = call(*words, "--output", tmp_path / "out")
-        assert answer.exit_code == 0, answer.output
-        (one,) = read_results(tmp_path / "out")
-        assert one.latent == []
+        pruned = {
+            one.prior: "pruned" in read_manifest(folder / "cells" / one.key / "bundle")[0].training
+            for one in read_results(folder)
+        }
+        assert pruned == {"plain": False, "flow-ard": True}
 
     def test_the_report_is_one_file_with_tables_and_panels(self, swept, tmp_path):
         folder, _, _ = swept
