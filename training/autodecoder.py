@@ -13,6 +13,7 @@ from model.networks.decoder import OccupancyDecoder
 from model.networks.prior import LatentPrior
 from training.config import TrainingConfig
 from training.objective import gaussian_entropy, reconstruction_loss
+from training.recorded import RecordedStep
 from training.samples import Batch, PointPool, ShapePoints
 
 #: Standard deviation of the codes' noise with the denoising objective.
@@ -33,10 +34,12 @@ class AutoDecoder(nn.Module):
         pressure: factor on `lambda_flow` and `lambda_ard` of the objective, from 0 to 1.
     """
 
+    pressure: Tensor
+
     def __init__(self, config: TrainingConfig, shapes: int) -> None:
         super().__init__()
         self.config = config
-        self.pressure = 1.0
+        self.register_buffer("pressure", torch.ones(()), persistent=False)
         self.decoder = OccupancyDecoder(config.decoder)
         self.prior = LatentPrior(config.prior)
         size = config.decoder.latent_size
@@ -101,6 +104,9 @@ class Trainer:
     step: int = 0
     finished: bool = False
 
+    def __post_init__(self) -> None:
+        self._make_ready()
+
     @classmethod
     def start(cls, config: TrainingConfig, shapes: Sequence[ShapePoints]) -> "Trainer":
         """A fresh run, seeded."""
@@ -112,8 +118,17 @@ class Trainer:
 
     def advance(self, *, read: bool = True) -> dict[str, float]:
         """One optimiser step; returns its figures, or none when they are not to be read from the device."""
-        config = self.config
         self._schedule()
+        terms = self._descend()
+        self.step += 1
+        return {name: value.item() for name, value in terms.items()} if read else {}
+
+    def _make_ready(self) -> None:
+        on_gpu = self.pool.device.type == "cuda"
+        self._descend = RecordedStep(self._descent, self.generator) if on_gpu else self._descent
+
+    def _descent(self) -> dict[str, Tensor]:
+        config = self.config
         size = min(config.batch_shapes, self.pool.size)
         chosen = torch.randperm(self.pool.size, generator=self.generator, device=self.pool.device)[:size]
         batch = self.pool.draw(chosen, (config.near_points, config.far_points), self.generator)
@@ -122,8 +137,7 @@ class Trainer:
         terms["loss"].backward()
         nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
         self.optimiser.step()
-        self.step += 1
-        return {name: value.item() for name, value in terms.items()} if read else {}
+        return {name: value.detach() for name, value in terms.items()}
 
     def at_end(self) -> bool:
         """Whether the last step was made, or an earlier one was found to be the last."""
@@ -132,12 +146,13 @@ class Trainer:
     def _schedule(self) -> None:
         progress = self.step / self.config.steps
         ramp = self.config.objective.ramp
-        self.module.pressure = min(1.0, progress / ramp) if ramp > 0 else 1.0
+        self.module.pressure.fill_(min(1.0, progress / ramp) if ramp > 0 else 1.0)
         rise = min(1.0, progress / self.config.warm_up) if self.config.warm_up > 0 else 1.0
         factor = rise * 0.5 * (1.0 + math.cos(math.pi * progress))
         for group in self.optimiser.param_groups:
             waiting = group["name"] == "flow" and progress < self.config.flow_start
-            group["lr"] = 0.0 if waiting else group["full_lr"] * factor
+            rate = 0.0 if waiting else group["full_lr"] * factor
+            group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
 
     def save(self, path: Path) -> None:
         """Write a checkpoint; replaced in one move, so that a killed run leaves a whole one."""
@@ -161,10 +176,14 @@ class Trainer:
         self.generator.set_state(state["generator"].cpu())
         self.step = state["step"]
         self.finished = bool(state.get("finished", False))
+        self._make_ready()
 
 
 def _optimiser(module: AutoDecoder, config: TrainingConfig) -> torch.optim.Optimizer:
+    """On a GPU rates are tensors, which a recorded step reads anew."""
     codes = [parameter for parameter in (module.mean, module.log_deviation) if parameter.requires_grad]
+    device = module.mean.device
+    on_gpu = device.type == "cuda"
     groups = [
         ("decoder", list(module.decoder.parameters()), config.learning_rate, config.weight_decay),
         ("flow", list(module.prior.flow.parameters()), config.flow_learning_rate, config.weight_decay),
@@ -172,9 +191,19 @@ def _optimiser(module: AutoDecoder, config: TrainingConfig) -> torch.optim.Optim
         ("codes", codes, config.code_learning_rate, 0.0),
     ]
     return torch.optim.AdamW(
-        [{"name": n, "params": p, "lr": r, "full_lr": r, "weight_decay": w} for n, p, r, w in groups],
+        [
+            {
+                "name": name,
+                "params": parameters,
+                "lr": torch.tensor(rate, device=device) if on_gpu else rate,
+                "full_lr": rate,
+                "weight_decay": decay,
+            }
+            for name, parameters, rate, decay in groups
+        ],
         betas=(0.9, 0.99),
         fused=True,
+        capturable=on_gpu,
     )
 
 

@@ -214,5 +214,5 @@ def test_the_weight_of_the_prior_rises_along_the_ramp():
     found = []
     for _ in range(CONFIG.steps):
         trainer.advance()
-        found.append(trainer.module.pressure)
+        found.append(trainer.module.pressure.item())
     assert found == pytest.approx([min(1.0, step / (0.5 * CONFIG.steps)) for step in range(CONFIG.steps)])
