@@ -57,8 +57,8 @@ def configured(
     regime: RegimeName,
     latent_size: int,
     *,
-    flow: bool,
-    ard: bool,
+    flow: bool | None = None,
+    ard: bool | None = None,
     reflected: bool,
     seed: int,
     device: DeviceName,
@@ -66,17 +66,23 @@ def configured(
 ) -> "TrainingConfig":
     """The configuration that the options describe; the default weight of ARD when None.
 
-    ``paper`` is the MorphoFlow paper as written: points as codes, soft Dice, a plain decoder, the flow on the codes
-    themselves, batches of 6.
+    Flow and ARD are trained along with the decoder unless the objective is ``variational``, when None: codes that are
+    Gaussians get both when training is over (`training.pruning`). ``paper`` is the MorphoFlow paper as written: points
+    as codes, soft Dice, a plain decoder, the flow on the codes themselves, batches of 6.
     """
     from model.networks.decoder import DecoderShape
     from model.networks.flow import FlowShape
     from model.networks.prior import PriorShape
     from training.config import ObjectiveConfig, TrainingConfig
 
-    paper = objective is ObjectiveName.PAPER
+    paper, together = objective is ObjectiveName.PAPER, objective is not ObjectiveName.VARIATIONAL
     plain = TrainingConfig()
-    prior = replace(PriorShape(FlowShape(latent_size=latent_size)), use_flow=flow, use_ard=ard, standardise=not paper)
+    prior = replace(
+        PriorShape(FlowShape(latent_size=latent_size)),
+        use_flow=together if flow is None else flow,
+        use_ard=together if ard is None else ard,
+        standardise=not paper,
+    )
     loss = (
         ObjectiveConfig(name="paper", reconstruction="dice", ramp=0.0)
         if paper

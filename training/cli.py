@@ -59,10 +59,16 @@ def train(
     latent_size: Annotated[int, typer.Option(min=1, max=1024, help="Dimensions of the latent code.")] = 64,
     steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps.")] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Passes over the cohort, in place of --steps.")] = None,
-    flow: Annotated[bool, typer.Option("--flow/--no-flow", help="Whether the prior has a flow.")] = True,
-    ard: Annotated[bool, typer.Option("--ard/--no-ard", help="Whether relevance is determined.")] = True,
+    flow: Annotated[
+        bool | None,
+        typer.Option("--flow/--no-flow", help="Whether a flow is trained along; export fits one unless objectives do."),
+    ] = None,
+    ard: Annotated[
+        bool | None,
+        typer.Option("--ard/--no-ard", help="Whether relevance is determined along; export does it otherwise."),
+    ] = None,
     ard_weight: Annotated[
-        float | None, typer.Option(min=0.0, help="Of relevance determination; more leaves fewer dimensions alive.")
+        float | None, typer.Option(min=0.0, help="Of --ard; more leaves fewer dimensions alive.")
     ] = None,
     reflect: Annotated[
         bool | None,
@@ -108,7 +114,9 @@ def export(
     output: Annotated[Path, typer.Option(help="Folder of the bundle; created.")],
     name: Annotated[str | None, typer.Option(help="Name of the model; the cohort's when left out.")] = None,
     version: Annotated[str, typer.Option(help="Version of the model.")] = "1",
-    prune: Annotated[bool, typer.Option("--prune", help="Only the dimensions that ARD kept alive.")] = False,
+    prune: Annotated[
+        bool, typer.Option("--prune", help="Fit flow and relevance to the codes, keep relevant dimensions alone.")
+    ] = False,
     resolution_mm: Annotated[
         float, typer.Option(min=0.25, max=10.0, help="Grid step of surfaces (mm) unless a request names another.")
     ] = 1.0,
@@ -119,6 +127,7 @@ def export(
 ) -> None:
     """Export a run as a bundle that the service loads."""
     with exit_status():
+        from training.pruning import PriorParts
         from training.release import export_run
 
         manifest = export_run(
@@ -126,7 +135,7 @@ def export(
             output,
             name=name,
             version=version,
-            prune=prune,
+            parts=PriorParts() if prune else None,
             anatomy=anatomy_code(anatomy),
             resolution_mm=resolution_mm,
         )

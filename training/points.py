@@ -6,6 +6,7 @@ beyond a face of the crop that cuts the object off: nothing is said there.
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,18 +66,19 @@ def window(case: Case, margin_mm: float = MARGIN_MM, *, cut_is_end: bool = False
     return Window(mask, Grid((mask.shape[0], mask.shape[1], mask.shape[2]), affine), unknown)
 
 
-def cohort_points(cases: Sequence[Case], regime: Regime, seed: int) -> list[ShapePoints]:
-    """Points of all training shapes; a pure function of cases, regime and seed.
+def cohort_points(cases: Sequence[Case], regime: Regime, seed: int, threads: int = 1) -> list[ShapePoints]:
+    """Points of all training shapes; a pure function of cases, regime and seed, whatever the number of threads.
 
     When most of the masks touch their crops, as cut bones do, the cut counts as the object's end.
     """
     cut_is_end = 2 * sum(touches_border(case.mask) for case in cases) > len(cases)
     limit = int(np.clip(TOTAL_POINTS // max(len(cases), 1), *POINTS_RANGE))
-    streams = np.random.default_rng(seed).spawn(len(cases))
-    return [
-        shape_points(window(case, cut_is_end=cut_is_end), regime, rng, limit)
-        for case, rng in zip(cases, streams, strict=True)
-    ]
+
+    def points_of(case: Case, rng: np.random.Generator) -> ShapePoints:
+        return shape_points(window(case, cut_is_end=cut_is_end), regime, rng, limit)
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(points_of, cases, np.random.default_rng(seed).spawn(len(cases))))
 
 
 def shape_points(found: Window, regime: Regime, rng: np.random.Generator, limit: int) -> ShapePoints:

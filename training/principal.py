@@ -1,7 +1,7 @@
 """Latent coordinates along the principal movements of the surface.
 
 A latent code is known up to an affine change of coordinates, which decoder and prior absorb. It is chosen here so that
-coordinates are uncorrelated over the training codes and a step of the code is as long as the surface moves: the mean
+coordinates are uncorrelated over the population and a step of the code is as long as the surface moves: the mean
 distance along the normal over the surface (mm), to first order, on average over training codes. Sigmas are then
 movements in mm, largest first, and distances between codes are average surface distances, as far as the decoder bends
 little between them. It is to the decoder what principal component analysis is to a set of points.
@@ -33,7 +33,7 @@ class PrincipalAxes:
 
     Attributes:
         axes: (k, k), of full rank.
-        sigma: (k,) standard deviation of each new coordinate over the training codes (mm), largest first.
+        sigma: (k,) standard deviation of each new coordinate over the population (mm), largest first.
     """
 
     centre: Float[Tensor, "k"]
@@ -49,11 +49,10 @@ class PrincipalAxes:
 def principal_axes(
     decoder: OccupancyDecoder,
     codes: Float[Tensor, "m k"],
-    deviation: Float[Tensor, "m k"],
+    covariance: Float[Tensor, "k k"],
     half_extent_mm: Sequence[float],
 ) -> PrincipalAxes:
-    """Axes of Gaussian codes: their means, standard deviations, and the box (mm) that holds their surfaces."""
-    covariance = torch.cov(codes.T, correction=0) + torch.diag(deviation.square().mean(dim=0))
+    """Axes of a population of codes, given its covariance and the box (mm) that holds the surfaces."""
     spread = torch.linalg.cholesky(covariance.double())
     squares, turn = torch.linalg.eigh(
         length_metric([found @ spread for found in movements(decoder, codes, half_extent_mm)])

@@ -1,16 +1,21 @@
-"""A trained decoder and prior without the dimensions that ARD left unused.
+"""Relevance of a trained model's dimensions, the ones that matter alone, and the prior fitted to their codes.
 
-A dimension is dead when ARD left it next to no sigma, so that it moves no surface, or when its codes say nothing: the
-divergence of the posterior from the prior along it, averaged over the training shapes, is next to zero. What it adds
-at its mean goes into biases, so the field of the pruned decoder is that of the whole one with dead dimensions at their
-mean. The flow is autoregressive: dead dimensions enter the conditioners of live ones as their mean too, transform
+A dimension is dead when training left it next to no sigma, so that it moves no surface, or when its codes say nothing:
+the divergence of the posterior from the prior along it, averaged over the training shapes, is next to zero. What it
+adds at its mean goes into biases, so the field of the pruned decoder is that of the whole one with dead dimensions at
+their mean. The flow is autoregressive: dead dimensions enter the conditioners of live ones as their mean too, transform
 after transform. Between transforms a dead dimension may follow live ones a little; `Pruned.base_change` measures what
-that alters. `refitted` then turns the live dimensions to the principal movements of the surface (`training.principal`)
-and fits the flow anew to the codes in these coordinates; those that move next to nothing are left out as well.
+that alters.
+
+`refitted` goes on with codes that are Gaussians. It turns them to the principal movements of the surface
+(`training.principal`) and determines relevance there in closed form: with the decoder given, the evidence is largest
+where a sigma is the root mean square of its coordinate over the posteriors of all codes (MacKay 1995; Bishop 1999 for
+principal components), here of their shrunk covariance (`training.shrinkage`). Coordinates that then move next to
+nothing are left out, and the flow is fitted to the codes in those that stay.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
@@ -25,11 +30,22 @@ from model.networks.splines import parameter_count
 from training.autodecoder import AutoDecoder
 from training.principal import principal_axes, turned_decoder
 from training.prior_fit import Codes, fitted_prior
+from training.shrinkage import shrunk_covariance
 
 #: A dimension whose divergence is below this (nats a training shape) is dead.
 LEAST_NATS = 0.02
 #: So is one whose sigma, or standard deviation of the codes where these are points, is below this share of the largest.
 LEAST_SHARE = 0.02
+#: Principal movements below this share of the largest are left out.
+LEAST_MOVEMENT = 0.02
+
+
+@dataclass(frozen=True)
+class PriorParts:
+    """What is fitted to the codes of a finished run: a flow, and the relevance of dimensions, or all of them stay."""
+
+    flow: bool = True
+    ard: bool = True
 
 
 @dataclass(frozen=True)
@@ -43,7 +59,8 @@ class Pruned:
         base_change: largest change of a live base coordinate of a training code, in sigmas, with the flow as it was.
         trained_sigmas: (d,) of the whole prior.
         flow_gain: what the flow that was fitted anew adds to the log density of held-out codes (nats); None before.
-        principal: whether coordinates are those of `training.principal`.
+        fitted: the parts of the prior that `refitted` made, in the coordinates of `training.principal`; None before.
+        shrinkage: share of the prior of the training in the covariance of the codes; None before.
     """
 
     decoder: OccupancyDecoder
@@ -54,33 +71,42 @@ class Pruned:
     base_change: float
     trained_sigmas: Float[np.ndarray, "d"]
     flow_gain: float | None = None
-    principal: bool = False
+    fitted: PriorParts | None = None
+    shrinkage: float | None = None
 
     def facts(self) -> dict[str, object]:
         """What the manifest says of it."""
         return {
             "dimensions_before": len(self.nats),
             "live": self.live.tolist(),
-            "rule": f"sigma at least {LEAST_SHARE:g} of the largest and divergence at least {LEAST_NATS:g} nats a shape"
-            if np.isfinite(self.nats).all()
-            else f"standard deviation of the codes at least {LEAST_SHARE:g} of the largest",
+            "rule": self.rule(),
             "nats": [None if np.isnan(value) else float(value) for value in self.nats],
             "largest_base_change_in_sigmas": self.base_change,
             "trained_sigmas": self.trained_sigmas.tolist(),
-            "principal": self.principal,
+            "fitted": None if self.fitted is None else asdict(self.fitted),
+            "shrinkage": self.shrinkage,
             "flow_gain_nats": self.flow_gain,
         }
 
+    def rule(self) -> str:
+        """By what dimensions were kept, in words."""
+        if self.fitted is not None and not self.fitted.ard:
+            return "all"
+        if np.isnan(self.nats).any():
+            return f"standard deviation of the codes at least {LEAST_SHARE:g} of the largest"
+        trained = f"sigma at least {LEAST_SHARE:g} of the largest and divergence at least {LEAST_NATS:g} nats a shape"
+        return trained if self.fitted is None else f"{trained}; movement at least {LEAST_MOVEMENT:g} of the largest"
+
 
 @torch.no_grad()
-def pruned(module: AutoDecoder) -> Pruned:
+def pruned(module: AutoDecoder, *, keep_all: bool = False) -> Pruned:
     """Decoder and prior without dead dimensions.
 
     Raises:
         InvalidParameter: all dimensions are dead.
     """
     nats = divergences(module)
-    live = live_dimensions(module, nats)
+    live = np.full(len(nats), keep_all) | live_dimensions(module, nats)
     if not live.any():
         raise InvalidParameter("All dimensions are dead; a run with at least one live one is accepted.", part="prune")
     kept, codes = torch.from_numpy(np.flatnonzero(live)), module.code_means()
@@ -93,26 +119,49 @@ def pruned(module: AutoDecoder) -> Pruned:
     return Pruned(decoder.eval(), prior.eval(), kept.numpy(), codes[:, kept], nats, float(change), sigmas)
 
 
-def refitted(less: Pruned, module: AutoDecoder, shapes: int, half_extent_mm: Sequence[float]) -> Pruned:
-    """The same in principal coordinates, with a flow fitted anew to the codes there, where codes are Gaussians.
+def refitted(
+    module: AutoDecoder, shapes: int, half_extent_mm: Sequence[float], parts: PriorParts | None = None
+) -> Pruned:
+    """The networks in principal coordinates with a prior fitted to the codes; just pruned where codes are points.
 
     Args:
         shapes: number of training shapes; codes beyond are those of their mirror images, in the same order.
         half_extent_mm: half sides of the box that holds all surfaces.
+        parts: what is fitted; all when None.
     """
+    parts = PriorParts() if parts is None else parts
+    less = pruned(module, keep_all=module.random and not parts.ard)
     if not module.random:
         return less
+    codes, target = live_codes(module, less, shapes)
+    covariance, share = shrunk_covariance(codes, target)
     with torch.no_grad():
-        everyone = torch.arange(len(less.codes))
-        deviation = module.log_deviations(everyone)[:, torch.from_numpy(less.live)].exp()
-        axes = principal_axes(less.decoder, less.codes, deviation, half_extent_mm)
-        moving = torch.arange(int((axes.sigma >= LEAST_SHARE * axes.sigma[0]).sum()))
+        axes = principal_axes(less.decoder, codes.mean, covariance, half_extent_mm)
+        least = LEAST_MOVEMENT if parts.ard else 0.0
+        moving = torch.arange(int((axes.sigma >= least * axes.sigma[0]).sum()))
         decoder = pruned_decoder(turned_decoder(less.decoder, axes), moving, torch.zeros(len(axes.sigma)))
-        codes = axes.of(less.codes)[:, moving]
-        start = LatentPrior(replace(less.prior.shape, flow=replace(less.prior.shape.flow, latent_size=len(moving))))
-        start.log_sigma.copy_(axes.sigma[moving].log())
-    prior, gain = fitted_prior(start, Codes(codes, deviation, everyone % shapes, axes.axes[:, moving]))
-    return replace(less, decoder=decoder.eval(), prior=prior, codes=codes, flow_gain=gain, principal=True)
+        turned = Codes(axes.of(codes.mean)[:, moving], codes.deviation, codes.group, axes.axes[:, moving])
+    prior, gain = fitted_prior(gaussian_prior(module, axes.sigma[moving], flow=parts.flow), turned)
+    return replace(
+        less, decoder=decoder.eval(), prior=prior, codes=turned.mean, flow_gain=gain, fitted=parts, shrinkage=share
+    )
+
+
+@torch.no_grad()
+def live_codes(module: AutoDecoder, less: Pruned, shapes: int) -> tuple[Codes, Float[Tensor, "k k"]]:
+    """Gaussian codes over live dimensions, and the covariance of the prior that they were trained under."""
+    everyone, kept = torch.arange(len(less.codes)), torch.from_numpy(less.live)
+    deviation = module.log_deviations(everyone)[:, kept].exp()
+    return Codes(less.codes, deviation, everyone % shapes), torch.diag(module.prior.sigma[kept].square())
+
+
+@torch.no_grad()
+def gaussian_prior(module: AutoDecoder, sigma: Float[Tensor, "k"], *, flow: bool) -> LatentPrior:
+    """The prior of these sigmas whose flow, if it is to have one, is the identity yet."""
+    shape = module.prior.shape
+    prior = LatentPrior(replace(shape, flow=replace(shape.flow, latent_size=len(sigma)), use_flow=flow))
+    prior.log_sigma.copy_(sigma.log())
+    return prior
 
 
 @torch.no_grad()

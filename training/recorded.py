@@ -4,6 +4,7 @@ A step is some hundreds of small kernels, and starting each of them from Python 
 starts them all with one call.
 """
 
+import threading
 from collections.abc import Callable
 
 import torch
@@ -11,6 +12,8 @@ from torch import Tensor
 
 #: Steps that run as they are before the recording, so that libraries and the optimiser have made what they keep.
 WARM_UP = 3
+#: One recording at a time in this process: the allocator and the driver are shared.
+_RECORDING = threading.Lock()
 
 
 class RecordedStep:
@@ -52,6 +55,6 @@ class RecordedStep:
     def _record(self) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
         graph.register_generator_state(self._generator)
-        with torch.cuda.graph(graph, stream=self._aside, capture_error_mode="thread_local"):
+        with _RECORDING, torch.cuda.graph(graph, stream=self._aside, capture_error_mode="thread_local"):
             self._figures = self._step()
         return graph

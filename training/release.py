@@ -18,7 +18,7 @@ from model.networks.export import export_graphs
 from model.networks.prior import LatentPrior
 from training.autodecoder import AutoDecoder
 from training.config import TrainingConfig
-from training.pruning import pruned, refitted
+from training.pruning import PriorParts, refitted
 from training.runs import CHECKPOINT, read_record
 
 #: Shares of the base variance for which active dimensions are counted (MorphoFlow paper).
@@ -37,11 +37,11 @@ def export_run(
     version: str = "1",
     likelihood_precision: float = UNCALIBRATED_PRECISION,
     accuracy: Mapping[str, Mapping[str, float]] | None = None,
-    prune: bool = False,
+    parts: PriorParts | None = None,
     anatomy: Mapping[str, str] | None = None,
     resolution_mm: float = RESOLUTION_MM,
 ) -> Manifest:
-    """Write the bundle of a finished run, of its live dimensions alone with `prune` (`training.pruning`).
+    """Write the bundle of a finished run: as it was trained, or with these parts of a prior fitted to its codes.
 
     `anatomy` is the code that results in DICOM carry (`model.bundle.Manifest.anatomy`).
 
@@ -54,7 +54,7 @@ def export_run(
     if output.exists() and any(output.iterdir()):
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
     output.mkdir(parents=True, exist_ok=True)
-    less = refitted(pruned(module), module, len(record["train"]), record["half_extent_mm"]) if prune else None
+    less = None if parts is None else refitted(module, len(record["train"]), record["half_extent_mm"], parts)
     decoder, prior = (module.decoder, module.prior) if less is None else (less.decoder, less.prior)
     with _quiet_exporter():
         files = export_graphs(decoder, prior, output)

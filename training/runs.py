@@ -3,11 +3,12 @@
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from model.errors import InvalidParameter
@@ -28,6 +29,43 @@ VALIDATED = 32
 Watch = Callable[[int, dict[str, float]], None]
 
 
+@dataclass(frozen=True)
+class Run:
+    """A training in its folder, ready to go on from where an earlier attempt left it."""
+
+    trainer: Trainer
+    cohort: Cohort
+    folder: Path
+
+    def go(self, watch: Watch = lambda step, figures: None) -> AutoDecoder:
+        """Train to the end; leaves ``checkpoint.pt`` and the figures."""
+        trainer = self.trainer
+        with SummaryWriter(self.folder / FIGURES, purge_step=trainer.step) as writer:
+            logging = _logging_watch(writer, watch)
+            stopping = EarlyStopping(trainer, self.folder)
+            return train(trainer, self.folder, _validating_watch(trainer, self.cohort, writer, logging, stopping))
+
+
+def prepare(cohort: Cohort, config: TrainingConfig, folder: Path, *, resume: bool = False) -> Run:
+    """Points on the device, the module and its checkpoint, if there is one; leaves ``run.json``.
+
+    Raises:
+        InvalidParameter: the folder holds a run and `resume` is off, or its run was made of something else.
+    """
+    shapes = cohort_points(cohort.train, config.regime, config.seed, torch.get_num_threads())
+    if config.reflected:
+        shapes += [shape.reflected() for shape in shapes]
+    config = replace(config, decoder=replace(config.decoder, extent_mm=decoder_extent(shapes)))
+    checkpoint = folder / CHECKPOINT
+    _check_folder(folder, record(cohort, config), resume=resume)
+    trainer = Trainer.start(config, shapes)
+    if resume and checkpoint.is_file():
+        trainer.load(checkpoint)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / RECORD).write_text(json.dumps(record(cohort, config), indent=2) + "\n", encoding="utf-8")
+    return Run(trainer, cohort, folder)
+
+
 def train_cohort(
     cohort: Cohort,
     config: TrainingConfig,
@@ -41,21 +79,19 @@ def train_cohort(
     Raises:
         InvalidParameter: the folder holds a run and `resume` is off, or its run was made of something else.
     """
-    shapes = cohort_points(cohort.train, config.regime, config.seed)
-    if config.reflected:
-        shapes += [shape.reflected() for shape in shapes]
-    config = replace(config, decoder=replace(config.decoder, extent_mm=decoder_extent(shapes)))
-    checkpoint = folder / CHECKPOINT
-    _check_folder(folder, record(cohort, config), resume=resume)
-    trainer = Trainer.start(config, shapes)
-    if resume and checkpoint.is_file():
-        trainer.load(checkpoint)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / RECORD).write_text(json.dumps(record(cohort, config), indent=2) + "\n", encoding="utf-8")
-    with SummaryWriter(folder / FIGURES, purge_step=trainer.step) as writer:
-        logging = _logging_watch(writer, watch)
-        stopping = EarlyStopping(trainer, folder)
-        return train(trainer, folder, _validating_watch(trainer, cohort, writer, logging, stopping))
+    return prepare(cohort, config, folder, resume=resume).go(watch)
+
+
+def is_finished(folder: Path, config: TrainingConfig) -> bool:
+    """Whether the folder holds a run of this configuration, on whatever device, that has reached its end."""
+    if not (folder / CHECKPOINT).is_file() or not (folder / RECORD).is_file():
+        return False
+    there, _ = read_record(folder)
+    decoder = replace(config.decoder, extent_mm=there.decoder.extent_mm)
+    if there != replace(config, decoder=decoder, device=there.device):
+        return False
+    state = torch.load(folder / CHECKPOINT, map_location="cpu", weights_only=True, mmap=True)
+    return bool(state.get("finished", False)) or state["step"] >= there.steps
 
 
 def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
@@ -132,7 +168,7 @@ def _validating_watch(
     if not cohort.validation:
         return watch
     chosen = cohort.validation[:: -(-len(cohort.validation) // VALIDATED)]
-    validation = Validation(config, cohort_points(chosen, "dense", config.seed))
+    validation = Validation(config, cohort_points(chosen, "dense", config.seed, torch.get_num_threads()))
 
     def validate(step: int, figures: dict[str, float]) -> None:
         watch(step, figures)

@@ -12,10 +12,10 @@ from training.reporting import panels
 from training.reporting.page import Chapter, Panel
 from training.reporting.paper import bone_of
 from training.reporting.tables import SIDES, lines_of, paired_difference
+from training.sweep.cell import CELLS
 from training.sweep.priors import PriorName
 from training.sweep.summary import correlation
 from training.sweep.table import Result
-from training.sweep.workers import CELLS
 
 #: The latent size of the paper's pictures.
 PICTURED = 64

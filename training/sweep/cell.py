@@ -24,14 +24,16 @@ from training.cohorts.cohort import Cohort
 from training.config import Regime, TrainingConfig
 from training.evaluate import Method, fills_of, measure
 from training.generation import SAMPLES, generated
+from training.pruning import PriorParts
 from training.release import active_dimensions, export_run
-from training.runs import CHECKPOINT, train_cohort
+from training.runs import CHECKPOINT, Run, is_finished, prepare
 from training.sparsify import for_evaluation
 from training.sweep.plan import Cell
 from training.sweep.priors import PriorName
 from training.sweep.table import FIGURES, Result
 
-RUN, BUNDLE = "run", "bundle"
+#: Folders of a sweep.
+TRAININGS, CELLS = "trainings", "cells"
 
 #: Told what is done and how much of it: words, done, total.
 Watch = Callable[[str, int, int], None]
@@ -58,10 +60,28 @@ class Effort:
     reflect: bool | None = None
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where the parts of a cell lie: its training's run, which other cells may share, and its bundle."""
+
+    run: Path
+    bundle: Path
+
+    @classmethod
+    def of(cls, sweep_folder: Path, cell: Cell) -> "Place":
+        """Of a cell in a sweep's folder."""
+        return cls(sweep_folder / TRAININGS / cell.training_key / "run", sweep_folder / CELLS / cell.key / "bundle")
+
+    @property
+    def is_exported(self) -> bool:
+        """Whether the bundle is there."""
+        return (self.bundle / "manifest.json").is_file()
+
+
 def run_cell(
     cell: Cell,
     cohort: Cohort,
-    folder: Path,
+    place: Place,
     effort: Effort,
     device: DeviceName,
     *,
@@ -71,17 +91,29 @@ def run_cell(
     """Bring a cell to its result, from wherever an earlier attempt left it.
 
     Args:
-        folder: of the cell; the run, its checkpoint and the bundle lie in it.
         known: whether the cohort is a public one, see `training.choices`.
     """
     begin = time.perf_counter()
-    bundle = folder / BUNDLE
-    if not (bundle / "manifest.json").is_file():
+    if not place.is_exported:
         config = config_of(cell, cohort, effort, device, known=known)
-        _train(cohort, config, folder / RUN, watch)
-        _export(folder / RUN, bundle, cohort, effort, prune=cell.prior is not PriorName.PLAIN)
-    model = open_bundle(bundle, threads=1)
+        if not is_finished(place.run, config):
+            prepared(cohort, config, place.run).go(lambda step, _: watch("training", step, config.steps))
+        _export(place, cohort, effort, parts_of(cell))
+    model = open_bundle(place.bundle, threads=1)
     return result_of(cell, model, cohort, effort, time.perf_counter() - begin, watch)
+
+
+def prepared(cohort: Cohort, config: TrainingConfig, run: Path) -> Run:
+    """A training from where it was left; what a killed one left without a checkpoint is cleared away."""
+    resume = (run / CHECKPOINT).is_file()
+    if run.exists() and not resume:
+        shutil.rmtree(run)
+    return prepare(cohort, config, run, resume=resume)
+
+
+def parts_of(cell: Cell) -> PriorParts | None:
+    """What is fitted to the codes of a cell's training: nothing where the cell is plain."""
+    return None if cell.prior is PriorName.PLAIN else PriorParts(flow=cell.prior.flow, ard=cell.prior.ard)
 
 
 def config_of(cell: Cell, cohort: Cohort, effort: Effort, device: DeviceName, *, known: bool) -> TrainingConfig:
@@ -94,8 +126,8 @@ def config_of(cell: Cell, cohort: Cohort, effort: Effort, device: DeviceName, *,
         objective,
         RegimeName(cell.regime),
         cell.latent_size,
-        flow=cell.prior.flow,
-        ard=cell.prior.ard,
+        flow=cell.together and cell.prior.flow,
+        ard=cell.together and cell.prior.ard,
         reflected=paired,
         seed=cell.seed,
         device=device,
@@ -151,27 +183,20 @@ def trained_sigmas(manifest: Manifest) -> list[float]:
     return list(manifest.sigmas if known is None else known)
 
 
-def adopt(bundle: Path, folder: Path) -> None:
+def adopt(bundle: Path, place: Place) -> None:
     """Take an exported bundle as a cell's own."""
     read_manifest(bundle)
-    if not (folder / BUNDLE).exists():
-        shutil.copytree(bundle, folder / BUNDLE)
+    if not place.bundle.exists():
+        shutil.copytree(bundle, place.bundle)
 
 
-def _train(cohort: Cohort, config: TrainingConfig, run: Path, watch: Watch) -> None:
-    resume = (run / CHECKPOINT).is_file()
-    if run.exists() and not resume:
-        shutil.rmtree(run)
-    train_cohort(cohort, config, run, resume=resume, watch=lambda step, figures: watch("training", step, config.steps))
-
-
-def _export(run: Path, bundle: Path, cohort: Cohort, effort: Effort, *, prune: bool) -> None:
-    part = bundle.with_name(f"{bundle.name}.part")
+def _export(place: Place, cohort: Cohort, effort: Effort, parts: PriorParts | None) -> None:
+    part = place.bundle.with_name(f"{place.bundle.name}.part")
     shutil.rmtree(part, ignore_errors=True)
-    export_run(run, part, prune=prune)
+    export_run(place.run, part, parts=parts)
     if effort.calibrate and cohort.validation:
         calibrate_bundle(part, cohort, threads=1)
-    part.rename(bundle)
+    part.rename(place.bundle)
 
 
 def _measured(

@@ -10,7 +10,7 @@ import typer
 
 from model.bundle import read_manifest
 from model.errors import InvalidParameter
-from training.choices import DeviceName, ObjectiveName, RegimeName
+from training.choices import DeviceName, ObjectiveName, RegimeName, resolved
 from training.cohort_options import takes_cohort
 from training.cohorts import CohortOptions
 from training.cohorts.sources import CohortSource, open_cohort
@@ -53,10 +53,10 @@ def sweep(
 ) -> None:
     """Train and measure many models side by side, cell by cell; what is there is skipped."""
     with exit_status():
-        from training.sweep.cell import Effort, adopt
+        from training.sweep.cell import Effort, Place, adopt
         from training.sweep.plan import cell_of, cells_of
         from training.sweep.record import write_record
-        from training.sweep.workers import Sweep, cell_folder
+        from training.sweep.workers import Sweep
 
         found = open_cohort(source, options)
         tell_findings(found)
@@ -67,7 +67,7 @@ def sweep(
         write_record(output, source, options)
         given = {cell_of(read_manifest(path)[0]): path for path in bundle or ()}
         for cell, path in given.items():
-            adopt(path, cell_folder(output, cell))
+            adopt(path, Place.of(output, cell))
         sizes, regimes, priors = latent_size or LATENT_SIZES, regime or REGIMES, prior or PRIORS
         asked = (
             []
@@ -91,6 +91,8 @@ def _run(plan: "Sweep", jobs: int | None, *, as_json: bool) -> None:
     from training.sweep.workers import refusals, unfinished, work
 
     plan.folder.mkdir(parents=True, exist_ok=True)
+    if resolved(plan.device) == "cuda":
+        _train_side_by_side(plan)
     if "LOCAL_RANK" in os.environ or jobs == 1:
         with progress(1, f"{len(unfinished(plan))} cells") as bar:
             task = bar.task_ids[0]
@@ -100,6 +102,18 @@ def _run(plan: "Sweep", jobs: int | None, *, as_json: bool) -> None:
     results = read_results(plan.folder) if (plan.folder / "results.jsonl").is_file() else []
     write_csv(results, plan.folder / CSV)
     _tell(plan, refusals(plan), len(unfinished(plan)), as_json=as_json)
+
+
+def _train_side_by_side(plan: "Sweep") -> None:
+    from training.sweep.streams import Progress, train_side_by_side
+
+    with progress(1, "training") as bar:
+
+        def watch(found: Progress) -> None:
+            words = f"training: {found.ended} of {found.begun} begun"
+            bar.update(bar.task_ids[0], description=words, completed=found.steps, total=found.all_steps)
+
+        train_side_by_side(plan, watch)
 
 
 def _watch_workers(plan: "Sweep", jobs: int) -> None:

@@ -1,7 +1,7 @@
-"""The cells of a sweep: every combination of latent size, regime, prior and seed."""
+"""The cells of a sweep: every combination of latent size, regime, prior and seed; and the trainings behind them."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from training.sweep.priors import PriorName
 
 @dataclass(frozen=True, order=True)
 class Cell:
-    """One training.
+    """One model that is measured.
 
     Attributes:
         regime: of the drawings that are trained on.
@@ -34,6 +34,16 @@ class Cell:
         return f"{self.regime}-d{self.latent_size}-{self.prior}-{self.objective}-s{self.seed}"
 
     @property
+    def together(self) -> bool:
+        """Whether the prior is trained along with the decoder; it is fitted to the finished codes otherwise."""
+        return self.objective != "variational"
+
+    @property
+    def training_key(self) -> str:
+        """Name of the training; cells that differ in what is fitted to its codes share it."""
+        return self.key if self.together else f"{self.regime}-d{self.latent_size}-{self.objective}-s{self.seed}"
+
+    @property
     def measured_in(self) -> tuple[Regime, ...]:
         """Regimes of the drawings that it is measured with: its own, all sparse ones after dense training."""
         return ("thin", "thick", "orthogonal") if self.regime == "dense" else (self.regime,)
@@ -51,17 +61,19 @@ def cells_of(
     return list(dict.fromkeys(Cell(regime, size, prior, seed, objective) for size, regime, prior, seed in found))
 
 
+def by_training(cells: Iterable[Cell]) -> dict[str, list[Cell]]:
+    """Cells under the keys of their trainings, in the order in which these first appear."""
+    found: dict[str, list[Cell]] = {}
+    for cell in cells:
+        found.setdefault(cell.training_key, []).append(cell)
+    return found
+
+
 def cell_of(manifest: Manifest) -> Cell:
-    """The cell that an exported bundle belongs to, by the configuration in its manifest."""
+    """The cell that an exported bundle belongs to, by what its manifest says of training and prior."""
     values: Any = manifest.training["config"]
     config = config_from_dict(values)
-    prior = {(True, True): PriorName.FLOW_ARD, (True, False): PriorName.FLOW, (False, True): PriorName.ARD}.get(
-        (config.prior.use_flow, config.prior.use_ard), PriorName.PLAIN
-    )
+    facts: Any = manifest.training.get("pruned") or {}
+    fitted = facts.get("fitted") or {"flow": config.prior.use_flow, "ard": config.prior.use_ard}
+    prior = PriorName.of(**fitted)
     return Cell(config.regime, config.decoder.latent_size, prior, config.seed, config.objective.name)
-
-
-def without(cells: Sequence[Cell], done: Iterable[str]) -> list[Cell]:
-    """The cells whose keys are not done."""
-    finished = set(done)
-    return [cell for cell in cells if cell.key not in finished]

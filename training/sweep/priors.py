@@ -11,6 +11,11 @@ class PriorName(StrEnum):
     ARD = "ard"
     PLAIN = "plain"
 
+    @classmethod
+    def of(cls, *, flow: bool, ard: bool) -> "PriorName":
+        """The name of these parts."""
+        return {(True, True): cls.FLOW_ARD, (True, False): cls.FLOW, (False, True): cls.ARD}.get((flow, ard), cls.PLAIN)
+
     @property
     def flow(self) -> bool:
         """Whether there is a flow."""

@@ -1,8 +1,9 @@
-"""Processes that share a sweep's folder: each takes the next cell that nobody holds.
+"""Processes that share a sweep's folder: each takes the next training that nobody holds, with its cells.
 
-A cell is held by a lock on a file in its folder, which the system lets go when a process dies, so that a killed
-sweep leaves nothing to clean. On the CPU each process computes with one thread; on one GPU several share it;
-`torchrun` starts one for each GPU, and these need no other word between them than the folder.
+A training is held by a lock on a file in its folder, which the system lets go when a process dies, so that a killed
+sweep leaves nothing to clean. On the CPU each process computes with one thread. Trainings on a GPU come first, side by
+side in one process (`training.sweep.streams`); `torchrun` starts one for each GPU, and these need no other word between
+them than the folder.
 """
 
 import fcntl
@@ -19,11 +20,11 @@ from training.choices import DeviceName
 from training.cohorts.assemble import CohortOptions
 from training.cohorts.cohort import Cohort
 from training.cohorts.sources import CohortSource, open_cohort
-from training.sweep.cell import Effort, Watch, run_cell
-from training.sweep.plan import Cell
+from training.sweep.cell import CELLS, TRAININGS, Effort, Place, Watch, run_cell
+from training.sweep.plan import Cell, by_training
 from training.sweep.table import append, done
 
-CELLS, REFUSED = "cells", "refused.txt"
+REFUSED = "refused.txt"
 
 
 @dataclass(frozen=True)
@@ -41,11 +42,6 @@ class Sweep:
     folder: Path
     effort: Effort
     device: DeviceName
-
-
-def cell_folder(sweep_folder: Path, cell: Cell) -> Path:
-    """Where a cell's run and bundle lie."""
-    return sweep_folder / CELLS / cell.key
 
 
 def start_workers(sweep: Sweep, jobs: int) -> list[BaseProcess]:
@@ -71,23 +67,35 @@ def work_for(sweep: Sweep, parent: int) -> None:
 
 
 def work(sweep: Sweep, watch: Watch = lambda words, done, total: None) -> None:
-    """Take cells until none is left that is neither done nor held by another process."""
+    """Take trainings until none is left whose cells are neither done nor held by another process."""
     import torch
 
     torch.set_num_threads(1)
-    if torch.cuda.is_available() and "LOCAL_RANK" in os.environ:
-        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
-    cohorts: dict[int, Cohort] = {}
-    for cell in sweep.cells:
-        folder = cell_folder(sweep.folder, cell)
-        with held(folder) as mine:
-            if mine and cell.key not in done(sweep.folder):
-                _attempt(sweep, cell, folder, cohorts, watch)
+    cohorts = Cohorts(sweep)
+    for key, cells in by_training(sweep.cells).items():
+        with held(sweep.folder / TRAININGS / key) as mine:
+            for cell in cells:
+                if mine and cell.key not in done(sweep.folder):
+                    _attempt(sweep, cell, cohorts, watch)
+
+
+class Cohorts:
+    """The cohort of each seed, opened when it is first asked for."""
+
+    def __init__(self, sweep: "Sweep") -> None:
+        self._sweep = sweep
+        self._open: dict[int, Cohort] = {}
+
+    def of(self, cell: Cell) -> Cohort:
+        """The cohort that a cell is trained on."""
+        if cell.seed not in self._open:
+            self._open[cell.seed] = open_cohort(self._sweep.source, replace(self._sweep.options, seed=cell.seed))
+        return self._open[cell.seed]
 
 
 @contextmanager
 def held(folder: Path) -> Iterator[bool]:
-    """Whether this process holds the cell while the block runs."""
+    """Whether this process holds the folder while the block runs."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as stream:
         try:
@@ -100,18 +108,21 @@ def held(folder: Path) -> Iterator[bool]:
 
 def refusals(sweep: Sweep) -> dict[str, str]:
     """Cells that could not be brought to a result, and why."""
-    paths = {cell.key: cell_folder(sweep.folder, cell) / REFUSED for cell in sweep.cells}
+    paths = {cell.key: _refusal(sweep, cell) for cell in sweep.cells}
     return {key: path.read_text(encoding="utf-8") for key, path in paths.items() if path.is_file()}
 
 
-def _attempt(sweep: Sweep, cell: Cell, folder: Path, cohorts: dict[int, Cohort], watch: Watch) -> None:
-    refused = folder / REFUSED
+def _refusal(sweep: Sweep, cell: Cell) -> Path:
+    return sweep.folder / CELLS / cell.key / REFUSED
+
+
+def _attempt(sweep: Sweep, cell: Cell, cohorts: Cohorts, watch: Watch) -> None:
+    refused = _refusal(sweep, cell)
+    refused.parent.mkdir(parents=True, exist_ok=True)
     refused.unlink(missing_ok=True)
     try:
-        if cell.seed not in cohorts:
-            cohorts[cell.seed] = open_cohort(sweep.source, replace(sweep.options, seed=cell.seed))
-        known = sweep.source.cohort is not None
-        result = run_cell(cell, cohorts[cell.seed], folder, sweep.effort, sweep.device, known=known, watch=watch)
+        place, known = Place.of(sweep.folder, cell), sweep.source.cohort is not None
+        result = run_cell(cell, cohorts.of(cell), place, sweep.effort, sweep.device, known=known, watch=watch)
         append(sweep.folder, result)
     except MorphoFlowError as error:
         refused.write_text(str(error), encoding="utf-8")

@@ -27,11 +27,12 @@ def decoder_of(seed):
 
 @pytest.fixture(scope="module", params=range(2))
 def parts(request):
-    """A decoder, codes with deviations, and their axes."""
+    """A decoder, codes, the covariance of their Gaussians, and axes."""
     decoder = decoder_of(request.param)
     codes = torch.randn(SHAPES, SIZE) @ torch.randn(SIZE, SIZE) * 0.4 + 0.2
     deviation = 0.1 + 0.1 * torch.rand(SHAPES, SIZE)
-    return decoder, codes, deviation, principal_axes(decoder, codes, deviation, HALF_MM)
+    covariance = torch.cov(codes.T, correction=0) + torch.diag(deviation.square().mean(dim=0))
+    return decoder, codes, covariance, principal_axes(decoder, codes, covariance, HALF_MM)
 
 
 @torch.no_grad()
@@ -45,11 +46,10 @@ def test_the_field_stays(parts):
 
 @torch.no_grad()
 def test_coordinates_are_uncorrelated_and_sigmas_theirs(parts):
-    _, codes, deviation, axes = parts
+    _, codes, covariance, axes = parts
     new = axes.of(codes)
-    spread = axes.axes.T @ torch.diag(deviation.square().mean(dim=0)) @ axes.axes
-    covariance = torch.cov(new.T, correction=0) + spread
-    torch.testing.assert_close(covariance, torch.diag(axes.sigma.square()), atol=1e-3, rtol=1e-3)
+    turned = axes.axes.T @ covariance @ axes.axes
+    torch.testing.assert_close(turned, torch.diag(axes.sigma.square()), atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(new.mean(dim=0), torch.zeros(SIZE), atol=1e-4, rtol=0.0)
     assert (axes.sigma.diff() <= 0).all()
 
@@ -95,6 +95,6 @@ def on_surface(decoder, code, points):
 
 
 def test_the_same_codes_give_the_same_axes(parts):
-    decoder, codes, deviation, axes = parts
-    again = principal_axes(decoder, codes, deviation, HALF_MM)
+    decoder, codes, covariance, axes = parts
+    again = principal_axes(decoder, codes, covariance, HALF_MM)
     torch.testing.assert_close(again.axes, axes.axes, atol=1e-4, rtol=1e-3)

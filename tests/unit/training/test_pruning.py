@@ -11,7 +11,7 @@ from model.networks.prior import PriorShape
 from tests.random_networks import randomise
 from training.autodecoder import AutoDecoder
 from training.config import ObjectiveConfig, TrainingConfig
-from training.pruning import LEAST_NATS, divergences, pruned
+from training.pruning import LEAST_MOVEMENT, LEAST_NATS, PriorParts, divergences, pruned, refitted
 
 SIZE, SHAPES = 6, 20
 LIVE = [0, 2, 3, 5]
@@ -121,3 +121,56 @@ def test_points_are_judged_by_their_spread():
 def test_a_run_of_which_nothing_is_alive_is_refused():
     with pytest.raises(InvalidParameter, match="at least one live one"):
         pruned(module_of(live=[]))
+
+
+HALF_MM = (20.0, 20.0, 20.0)
+
+
+@torch.no_grad()
+def base_moments(found):
+    """Mean and covariance of the training codes' means in the base, in sigmas."""
+    base = found.prior.to_base(found.codes)[0] / found.prior.sigma
+    return base.mean(dim=0), torch.cov(base.T, correction=0)
+
+
+class TestRefitted:
+    def test_the_base_is_the_standard_normal_of_the_codes(self, monkeypatch):
+        monkeypatch.setattr("training.shrinkage.SHARES", (0.0,))
+        found = refitted(module_of(), SHAPES, HALF_MM, PriorParts(flow=False))
+        mean, covariance = base_moments(found)
+        size = len(found.prior.sigma)
+        torch.testing.assert_close(mean, torch.zeros(size), atol=1e-4, rtol=0.0)
+        # The posteriors' own widths make up for the rest of one.
+        assert (torch.linalg.eigvalsh(covariance) < 1.0 + 1e-3).all()
+        assert float(covariance.diag().mean()) > 0.5
+        assert (found.prior.sigma.diff() <= 0).all()
+        assert found.facts()["fitted"] == {"flow": False, "ard": True}
+
+    def test_the_field_is_that_of_the_trained_decoder_at_the_same_codes(self):
+        module = module_of()
+        found = refitted(module, SHAPES, HALF_MM, PriorParts(ard=False))
+        points = 20.0 * torch.randn(SHAPES, 30, 3)
+        with torch.no_grad():
+            expected = module.decoder(module.code_means(), points)
+            torch.testing.assert_close(found.decoder(found.codes, points), expected, atol=5e-3, rtol=1e-3)
+
+    def test_without_relevance_all_dimensions_stay(self):
+        found = refitted(module_of(), SHAPES, HALF_MM, PriorParts(ard=False))
+        assert found.live.tolist() == list(range(SIZE))
+        assert len(found.prior.sigma) == SIZE
+        assert found.facts()["rule"] == "all"
+
+    def test_with_relevance_only_what_moves_the_surface_stays(self):
+        found = refitted(module_of(), SHAPES, HALF_MM)
+        assert found.live.tolist() == LIVE
+        sigma = found.prior.sigma
+        assert len(sigma) <= len(LIVE)
+        assert float(sigma.min()) >= LEAST_MOVEMENT * float(sigma.max())
+
+    @pytest.mark.parametrize("flow", [True, False])
+    def test_a_flow_is_there_when_it_is_asked_for(self, flow):
+        assert refitted(module_of(), SHAPES, HALF_MM, PriorParts(flow=flow)).prior.shape.use_flow is flow
+
+    def test_points_are_only_pruned(self):
+        found = refitted(module_of(objective="paper"), SHAPES, HALF_MM)
+        assert (found.fitted, found.live.tolist()) == (None, LIVE)

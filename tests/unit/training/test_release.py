@@ -15,6 +15,7 @@ from tests.ellipsoid_cohort import GRID, ellipsoids
 from training.autodecoder import AutoDecoder
 from training.cohorts import Case, Cohort, Provenance
 from training.config import TrainingConfig
+from training.pruning import PriorParts
 from training.release import active_dimensions, export_run, load_module
 from training.runs import half_extent, read_record, train_cohort
 
@@ -53,7 +54,7 @@ def released(run):
 @pytest.mark.slow
 class TestExport:
     def test_a_pruned_bundle_holds_the_live_dimensions_alone(self, run, tmp_path):
-        manifest = export_run(run, tmp_path / "pruned", prune=True)
+        manifest = export_run(run, tmp_path / "pruned", parts=PriorParts())
         facts = manifest.training["pruned"]
         opened = open_bundle(tmp_path / "pruned", threads=1)
         assert manifest.latent_size == len(manifest.sigmas) == len(facts["live"]) <= facts["dimensions_before"] == 3

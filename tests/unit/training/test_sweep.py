@@ -2,6 +2,7 @@ import csv
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from model.errors import InvalidParameter
 from training.cli import register
 from training.cohorts import CohortOptions
 from training.cohorts.sources import CohortSource
-from training.sweep.plan import Cell, cells_of
+from training.sweep.plan import Cell, by_training, cells_of
 from training.sweep.priors import PriorName
 from training.sweep.record import read_record, write_record
 from training.sweep.summary import correlation, row_of, write_csv
@@ -84,6 +85,14 @@ class TestPlan:
     @pytest.mark.parametrize("prior", PriorName)
     def test_priors_say_what_they_have(self, prior):
         assert (prior.flow, prior.ard) == ("flow" in prior.value, "ard" in prior.value)
+        assert PriorName.of(flow=prior.flow, ard=prior.ard) is prior
+
+    @pytest.mark.parametrize(("objective", "trainings"), [("variational", 2), ("paper", 8), ("centred", 8)])
+    def test_cells_share_a_training_where_the_prior_is_fitted_afterwards(self, objective, trainings):
+        cells = cells_of([16], ["thin", "thick"], PriorName, [0], objective)
+        found = by_training(cells)
+        assert len(found) == trainings
+        assert [cell for group in found.values() for cell in group] == cells
 
 
 class TestTable:
@@ -190,6 +199,19 @@ class TestSweep:
             for one in read_results(folder)
         }
         assert pruned == {"plain": False, "flow-ard": True}
+        assert len(list((folder / "trainings").glob("*/run/checkpoint.pt"))) == 1
+
+    @pytest.mark.parametrize("prior", ["flow", "ard"])
+    def test_other_parts_of_the_prior_use_the_training_that_is_there(self, swept, tmp_path, prior):
+        folder, words, _ = swept
+        shutil.copytree(folder / "trainings", tmp_path / "trainings")
+        shutil.copy(folder / "sweep.json", tmp_path)
+        (checkpoint,) = tmp_path.glob("trainings/*/run/checkpoint.pt")
+        before = checkpoint.stat().st_mtime_ns
+        answer = call(*words[:-4], tmp_path, "--prior", prior, "--jobs", 1)
+        assert answer.exit_code == 0, answer.output
+        (one,) = read_results(tmp_path)
+        assert (one.prior, checkpoint.stat().st_mtime_ns) == (prior, before)
 
     def test_the_report_is_one_file_with_tables_and_panels(self, swept, tmp_path):
         folder, _, _ = swept
@@ -227,18 +249,18 @@ def test_a_killed_sweep_goes_on_from_its_checkpoint(masks, tmp_path, repository)
         )  # fmt: skip
 
     first = start()
-    while not list(folder.glob("cells/*/run/checkpoint.pt")) and first.poll() is None:
+    while not list(folder.glob("trainings/*/run/checkpoint.pt")) and first.poll() is None:
         time.sleep(0.05)
     os.killpg(first.pid, signal.SIGKILL)
     first.communicate()
-    checkpoint = next(folder.glob("cells/*/run/checkpoint.pt"))
+    checkpoint = next(folder.glob("trainings/*/run/checkpoint.pt"))
     import torch
 
     reached = torch.load(checkpoint, weights_only=True)["step"]
     assert 0 < reached <= 1200
-    events = len(list(folder.glob("cells/*/run/figures/*")))
+    events = len(list(folder.glob("trainings/*/run/figures/*")))
     output, _ = (second := start()).communicate()
     assert second.returncode == 0, output
     (one,) = read_results(folder)
     assert one.steps == 1200
-    assert len(list(folder.glob("cells/*/run/figures/*"))) >= events
+    assert len(list(folder.glob("trainings/*/run/figures/*"))) >= events
