@@ -115,8 +115,16 @@ def export(
     name: Annotated[str | None, typer.Option(help="Name of the model; the cohort's when left out.")] = None,
     version: Annotated[str, typer.Option(help="Version of the model.")] = "1",
     prune: Annotated[
-        bool, typer.Option("--prune", help="Fit flow and relevance to the codes, keep relevant dimensions alone.")
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--prune/--no-prune",
+            help="Fit flow and relevance to the codes and keep relevant dimensions alone; left out, it is done unless "
+            "the training had a flow or ARD of its own.",
+        ),
+    ] = None,
+    least_movement: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="With pruning: what moves less than this share of the most goes.")
+    ] = 0.01,
     resolution_mm: Annotated[
         float, typer.Option(min=0.25, max=10.0, help="Grid step of surfaces (mm) unless a request names another.")
     ] = 1.0,
@@ -128,14 +136,15 @@ def export(
     """Export a run as a bundle that the service loads."""
     with exit_status():
         from training.pruning import PriorParts
-        from training.release import export_run
+        from training.release import default_parts, export_run
 
+        wanted = default_parts(run) is not None if prune is None else prune
         manifest = export_run(
             run,
             output,
             name=name,
             version=version,
-            parts=PriorParts() if prune else None,
+            parts=PriorParts(least_movement=least_movement) if wanted else None,
             anatomy=anatomy_code(anatomy),
             resolution_mm=resolution_mm,
         )

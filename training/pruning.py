@@ -36,16 +36,23 @@ from training.shrinkage import shrunk_covariance
 LEAST_NATS = 0.02
 #: So is one whose sigma, or standard deviation of the codes where these are points, is below this share of the largest.
 LEAST_SHARE = 0.02
-#: Principal movements below this share of the largest are left out.
-LEAST_MOVEMENT = 0.02
+#: Principal movements below this share of the largest are left out unless a caller says otherwise.
+LEAST_MOVEMENT = 0.01
 
 
 @dataclass(frozen=True)
 class PriorParts:
-    """What is fitted to the codes of a finished run: a flow, and the relevance of dimensions, or all of them stay."""
+    """What is fitted to the codes of a finished run.
+
+    Attributes:
+        flow: whether there is a flow; the base is the prior otherwise.
+        ard: whether irrelevant dimensions are left out; all stay otherwise.
+        least_movement: a dimension is irrelevant whose principal movement is below this share of the largest.
+    """
 
     flow: bool = True
     ard: bool = True
+    least_movement: float = LEAST_MOVEMENT
 
 
 @dataclass(frozen=True)
@@ -95,7 +102,8 @@ class Pruned:
         if np.isnan(self.nats).any():
             return f"standard deviation of the codes at least {LEAST_SHARE:g} of the largest"
         trained = f"sigma at least {LEAST_SHARE:g} of the largest and divergence at least {LEAST_NATS:g} nats a shape"
-        return trained if self.fitted is None else f"{trained}; movement at least {LEAST_MOVEMENT:g} of the largest"
+        moving = "" if self.fitted is None else f"; movement at least {self.fitted.least_movement:g} of the largest"
+        return f"{trained}{moving}"
 
 
 @torch.no_grad()
@@ -137,7 +145,7 @@ def refitted(
     covariance, share = shrunk_covariance(codes, target)
     with torch.no_grad():
         axes = principal_axes(less.decoder, codes.mean, covariance, half_extent_mm)
-        least = LEAST_MOVEMENT if parts.ard else 0.0
+        least = parts.least_movement if parts.ard else 0.0
         moving = torch.arange(int((axes.sigma >= least * axes.sigma[0]).sum()))
         decoder = pruned_decoder(turned_decoder(less.decoder, axes), moving, torch.zeros(len(axes.sigma)))
         turned = Codes(axes.of(codes.mean)[:, moving], codes.deviation, codes.group, axes.axes[:, moving])

@@ -119,6 +119,17 @@ def load_module(run: Path, config: TrainingConfig, shapes: int) -> AutoDecoder:
     return module.eval()
 
 
+def default_parts(run: Path) -> PriorParts | None:
+    """What is fitted to a run's codes unless a caller says otherwise: all, if they are Gaussians and nothing was yet.
+
+    Raises:
+        InvalidParameter: the folder holds no run.
+    """
+    config, _ = read_record(run)
+    trained = config.prior.use_flow or config.prior.use_ard
+    return None if trained or config.objective.name == "paper" else PriorParts()
+
+
 def write_population(
     prior: LatentPrior, codes: Float[torch.Tensor, "m d"], record: Mapping[str, Any], path: Path
 ) -> None:

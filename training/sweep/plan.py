@@ -75,5 +75,5 @@ def cell_of(manifest: Manifest) -> Cell:
     config = config_from_dict(values)
     facts: Any = manifest.training.get("pruned") or {}
     fitted = facts.get("fitted") or {"flow": config.prior.use_flow, "ard": config.prior.use_ard}
-    prior = PriorName.of(**fitted)
+    prior = PriorName.of(flow=fitted["flow"], ard=fitted["ard"])
     return Cell(config.regime, config.decoder.latent_size, prior, config.seed, config.objective.name)

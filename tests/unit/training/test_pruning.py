@@ -144,7 +144,7 @@ class TestRefitted:
         assert (torch.linalg.eigvalsh(covariance) < 1.0 + 1e-3).all()
         assert float(covariance.diag().mean()) > 0.5
         assert (found.prior.sigma.diff() <= 0).all()
-        assert found.facts()["fitted"] == {"flow": False, "ard": True}
+        assert found.facts()["fitted"] == {"flow": False, "ard": True, "least_movement": LEAST_MOVEMENT}
 
     def test_the_field_is_that_of_the_trained_decoder_at_the_same_codes(self):
         module = module_of()
@@ -166,6 +166,9 @@ class TestRefitted:
         sigma = found.prior.sigma
         assert len(sigma) <= len(LIVE)
         assert float(sigma.min()) >= LEAST_MOVEMENT * float(sigma.max())
+        fewer = refitted(module_of(), SHAPES, HALF_MM, PriorParts(least_movement=float(sigma[1] / sigma[0]) - 1e-3))
+        torch.testing.assert_close(fewer.prior.sigma, sigma[:2])
+        assert f"{fewer.fitted.least_movement:g} of the largest" in fewer.facts()["rule"]
 
     @pytest.mark.parametrize("flow", [True, False])
     def test_a_flow_is_there_when_it_is_asked_for(self, flow):
