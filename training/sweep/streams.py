@@ -8,11 +8,12 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, replace
 
 import torch
 
+from model.errors import MorphoFlowError
 from training.runs import Run, Watch, is_finished
 from training.sweep.cell import TRAININGS, Place, config_of, prepared
 from training.sweep.plan import Cell, by_training
@@ -37,7 +38,7 @@ def train_side_by_side(sweep: Sweep, watch: Callable[[Progress], None] = lambda 
 
     The points of the next one are made while those before it train.
     """
-    if "LOCAL_RANK" in os.environ:
+    if "LOCAL_RANK" in os.environ and torch.cuda.is_available():
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
     cohorts, slots, told = Cohorts(sweep), threading.BoundedSemaphore(STREAMS), _Told(watch)
     with ThreadPoolExecutor(STREAMS) as pool, ExitStack() as holding:
@@ -46,28 +47,44 @@ def train_side_by_side(sweep: Sweep, watch: Callable[[Progress], None] = lambda 
             run = _next_run(sweep, key, cells[0], cohorts, holding)
             if run is not None:
                 slots.acquire()
-                begun.append(pool.submit(_train_in_stream, run, torch.cuda.current_device(), told))
+                begun.append(pool.submit(_train, run, own_stream(run.trainer.pool.device), told))
                 begun[-1].add_done_callback(lambda _: slots.release())
         for future in begun:
             future.result()
 
 
 def _next_run(sweep: Sweep, key: str, cell: Cell, cohorts: Cohorts, holding: ExitStack) -> Run | None:
-    """The training of a cell, held by this process until all end; None where nothing is left to do."""
+    """The training of a cell, held by this process until all end; None where nothing is left to do.
+
+    One that is refused is left to the worker that comes to it, which records why.
+    """
     place = Place.of(sweep.folder, cell)
     if not holding.enter_context(held(sweep.folder / TRAININGS / key)) or place.is_exported:
         return None
     cohort, known = cohorts.of(cell), sweep.source.cohort is not None
     config = config_of(cell, cohort, sweep.effort, sweep.device, known=known)
-    return None if is_finished(place.run, config) else prepared(cohort, config, place.run)
+    try:
+        return None if is_finished(place.run, config) else prepared(cohort, config, place.run)
+    except MorphoFlowError:
+        return None
 
 
-def _train_in_stream(run: Run, device: int, told: "_Told") -> None:
+def own_stream(device: torch.device) -> AbstractContextManager[object]:
+    """What runs inside goes to a stream of its own on the present GPU, behind what was begun so far; as it is on a CPU.
+
+    For another thread to enter: streams and devices are chosen for each thread.
+    """
+    if device.type != "cuda":
+        return nullcontext()
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    return torch.cuda.stream(stream)
+
+
+def _train(run: Run, stream: AbstractContextManager[object], told: "_Told") -> None:
     told.begins(run)
-    with torch.cuda.device(device), torch.cuda.stream(torch.cuda.Stream()):
-        torch.cuda.current_stream().wait_stream(torch.cuda.default_stream())
+    with stream:
         run.go(told.watch(run))
-        torch.cuda.current_stream().synchronize()
     told.ends()
 
 

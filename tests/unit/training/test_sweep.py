@@ -12,20 +12,24 @@ from dataclasses import replace
 import nibabel as nib
 import numpy as np
 import pytest
+import torch
 import typer
 from typer.testing import CliRunner
 
 from model.bundle import read_manifest
 from model.errors import InvalidParameter
+from training.choices import DeviceName
 from training.cli import register
 from training.cohorts import CohortOptions
 from training.cohorts.sources import CohortSource
+from training.sweep.cell import Effort
 from training.sweep.plan import Cell, by_training, cells_of
 from training.sweep.priors import PriorName
 from training.sweep.record import read_record, write_record
+from training.sweep.streams import Progress, train_side_by_side
 from training.sweep.summary import correlation, row_of, write_csv
 from training.sweep.table import Result, append, done, read_results
-from training.sweep.workers import held
+from training.sweep.workers import Sweep, held, refusals, work
 
 QUICK = [
     "--latent-size",
@@ -254,8 +258,6 @@ def test_a_killed_sweep_goes_on_from_its_checkpoint(masks, tmp_path, repository)
     os.killpg(first.pid, signal.SIGKILL)
     first.communicate()
     checkpoint = next(folder.glob("trainings/*/run/checkpoint.pt"))
-    import torch
-
     reached = torch.load(checkpoint, weights_only=True)["step"]
     assert 0 < reached <= 1200
     events = len(list(folder.glob("trainings/*/run/figures/*")))
@@ -264,3 +266,53 @@ def test_a_killed_sweep_goes_on_from_its_checkpoint(masks, tmp_path, repository)
     (one,) = read_results(folder)
     assert one.steps == 1200
     assert len(list(folder.glob("trainings/*/run/figures/*"))) >= events
+
+
+class TestSideBySide:
+    """On a CPU here; on a GPU each training has a stream of its own besides."""
+
+    def plan(self, masks, folder, steps=8):
+        cells = tuple(cells_of([3, 4], ["thin", "thick"], [PriorName.PLAIN, PriorName.FLOW_ARD], [0], "variational"))
+        effort = Effort(steps=steps, calibrate=False, samples=0)
+        return Sweep(CohortSource(masks=masks), CohortOptions(), cells, folder, effort, DeviceName.CPU)
+
+    def weights(self, folder):
+        found = {}
+        for path in folder.glob("trainings/*/run/checkpoint.pt"):
+            state = torch.load(path, weights_only=True)
+            found[path.parts[-3]] = (state["step"], state["module"])
+        return found
+
+    def test_each_training_is_the_one_that_it_would_be_alone(self, masks, tmp_path):
+        seen = []
+        plan = self.plan(masks, tmp_path / "together")
+        train_side_by_side(plan, seen.append)
+        found = self.weights(plan.folder)
+        assert len(found) == 4
+        assert seen[-1] == Progress(begun=4, ended=4, steps=4 * 8, all_steps=4 * 8)
+        for cell in {cell.training_key: cell for cell in plan.cells}.values():
+            alone = replace(plan, cells=(cell,), folder=tmp_path / "alone")
+            train_side_by_side(alone)
+        for key, (step, module) in self.weights(tmp_path / "alone").items():
+            assert step == found[key][0] == 8
+            for name, value in module.items():
+                torch.testing.assert_close(found[key][1][name], value)
+
+    def test_what_is_there_and_what_another_holds_is_left(self, masks, tmp_path):
+        plan = self.plan(masks, tmp_path)
+        first = by_training(plan.cells)
+        with held(tmp_path / "trainings" / next(iter(first))):
+            train_side_by_side(plan)
+        assert set(self.weights(tmp_path)) == set(list(first)[1:])
+        times = {path: path.stat().st_mtime_ns for path in tmp_path.glob("trainings/*/run/checkpoint.pt")}
+        train_side_by_side(plan)
+        assert len(self.weights(tmp_path)) == 4
+        assert all(path.stat().st_mtime_ns == time for path, time in times.items())
+
+    def test_the_workers_record_why_one_is_refused(self, masks, tmp_path):
+        train_side_by_side(self.plan(masks, tmp_path))
+        other = self.plan(masks, tmp_path, steps=9)
+        train_side_by_side(other)
+        work(other)
+        assert len(refusals(other)) == len(other.cells)
+        assert all("other masks or settings" in words for words in refusals(other).values())
