@@ -55,11 +55,12 @@ def main(
     repeats: Annotated[int, typer.Option(min=1, help="Rounds of steps; the best counts.")] = 5,
     steps: Annotated[int, typer.Option(min=1, help="Steps of a round.")] = 10,
     device: Annotated[DeviceName, typer.Option(help="Where to compute.")] = DeviceName.AUTO,
+    together: Annotated[bool, typer.Option("--together", help="Train flow and ARD along.")] = False,
     profile: Annotated[bool, typer.Option("--profile", help="Print where the time of a step goes.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Write the result as JSON.")] = False,
 ) -> None:
     """Measure training on this machine."""
-    trainer = _trainer(latent_size, shapes, device)
+    trainer = _trainer(latent_size, shapes, device, together=together)
     speed = measured(trainer, repeats, steps)
     if profile:
         typer.echo(profiled(trainer, steps))
@@ -110,13 +111,13 @@ def profiled(trainer: Trainer, steps: int) -> str:
     return str(averages.table(sort_by="self_cpu_time_total", row_limit=20, max_name_column_width=50))
 
 
-def _trainer(latent_size: int, shapes: int, device: DeviceName) -> Trainer:
+def _trainer(latent_size: int, shapes: int, device: DeviceName, *, together: bool) -> Trainer:
     config = configured(
         ObjectiveName.VARIATIONAL,
         RegimeName.DENSE,
         latent_size,
-        flow=True,
-        ard=True,
+        flow=together,
+        ard=together,
         reflected=False,
         seed=0,
         device=device,
