@@ -28,7 +28,8 @@ from service.console import echo_json, in_order, progress, require_free, require
 from service.model_registry import ModelRegistry, load_registry
 from service.ports import Compute, MeshFormat, Outcome, SampleFormat
 from service.presentation import model_summary, summary_of
-from service.schemas import EstimateSchema, ModelList, Summary, parse_annotated, parse_labels
+from service.request_schemas import parse_annotated, parse_labels
+from service.schemas import EstimateSchema, ModelList, Summary
 from service.settings import Settings, load_settings
 
 #: Suffix of volumes that commands write.

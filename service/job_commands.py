@@ -27,7 +27,7 @@ from service.jobs.worker import supervised_workers
 from service.model_registry import pinned_name
 from service.observability import make_log
 from service.ports import RECONSTRUCTIONS_JOB, SAMPLES_JOB, MeshFormat, SampleFormat
-from service.schemas import parse_annotated, parse_labels
+from service.request_schemas import parse_annotated, parse_labels
 from service.settings import Settings, load_settings
 from service.stores import open_blobs, open_jobs
 

@@ -10,7 +10,7 @@ from model.errors import InvalidParameter
 from model.inference.calipers import USUAL_TEXT, parse_extents
 from service.job_ports import JobState
 from service.ports import RECONSTRUCTIONS_JOB, SAMPLES_JOB, MeshFormat, SampleFormat
-from service.schemas import Seed, SpacingMm, parse_annotated, parse_labels
+from service.request_schemas import Seed, SpacingMm, parse_annotated, parse_labels
 
 _OF_SAMPLES = ("count", "temperature", "spacing_mm", "reject")
 _OF_RECONSTRUCTIONS = ("archive", "label", "annotated", "uncertainty", "mirror", "resolution_mm", "fidelity", "extents")

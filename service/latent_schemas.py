@@ -5,7 +5,8 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.ports import MeshFormat
-from service.schemas import ModelReference, SpacingMm
+from service.request_schemas import SpacingMm
+from service.schemas import ModelReference
 
 #: Surfaces on the way between two reconstructions, at most.
 MOST_STEPS = 64

@@ -5,7 +5,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from model.errors import InvalidParameter
 from model.inference.modes import FARTHEST_SD
 from service.ports import MeshFormat
-from service.schemas import ActiveDimensions, ModelReference, SpacingMm
+from service.request_schemas import SpacingMm
+from service.schemas import ActiveDimensions, ModelReference
 
 
 class ModeMeshQuery(BaseModel):

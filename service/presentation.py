@@ -12,6 +12,7 @@ from model.inference.mask_stack import MaskStack, Plane, section_of
 from model.inference.next_plane import NextPlane
 from service.adapters.mesh_formats import RAMP
 from service.ports import Outcome, StoredResult
+from service.request_schemas import PlaneSchema
 from service.schemas import (
     ActiveDimensions,
     ColourLegend,
@@ -26,7 +27,6 @@ from service.schemas import (
     ModelReference,
     ModelSummary,
     NextPlaneSchema,
-    PlaneSchema,
     PoseSchema,
     ResidualSchema,
     ResultSummary,

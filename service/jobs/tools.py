@@ -10,7 +10,7 @@ from service.job_files import JobFiles
 from service.job_ports import BlobStore
 from service.observability import Log
 from service.ports import Catalogue, MaskReader, MeshWriter, ResultStore, VolumeWriter
-from service.schemas import parse_annotated, parse_labels
+from service.request_schemas import parse_annotated, parse_labels
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from starlette.responses import Response
 
 from service import use_cases
 from service.ports import MeshFormat, StoredResult
+from service.request_schemas import ComparisonQuery
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithServices, WithTicket
 from service.routes.meshes import model_metadata
 from service.routes.reconstructions import PATH
 from service.routes.responses import MESH_MEDIA_TYPES, attachment, files, problems
-from service.schemas import ComparisonQuery
 
 #: Formats that have room for scalars.
 SCALAR_FORMATS = (MeshFormat.PLY, MeshFormat.GLB, MeshFormat.VTP, MeshFormat.MZ3)

@@ -8,11 +8,12 @@ from model.errors import TooLarge
 from model.inference.mask_stack import MaskStack
 from service import use_cases
 from service.presentation import drawn_planes
+from service.request_schemas import PlanesForm, parse_annotated, parse_labels
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithServices, WithTicket
 from service.routes.multipart import require_multipart
 from service.routes.responses import problems
-from service.schemas import DrawnPlanes, PlanesForm, parse_annotated, parse_labels
+from service.schemas import DrawnPlanes
 
 PATH = "/v1/planes"
 

@@ -14,12 +14,13 @@ from service.adapters.posterior_files import PosteriorWriter
 from service.adapters.sample_files import MANIFEST
 from service.ports import Ticket
 from service.presentation import next_plane_summary
+from service.request_schemas import NextPlaneQuery, PosteriorQuery
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import WithServices, WithTicket
 from service.routes.reconstructions import PATH
 from service.routes.responses import ZIP, attachment, files, problems
 from service.routes.results import Identifier
-from service.schemas import NextPlaneQuery, NextPlaneSchema, PosteriorQuery
+from service.schemas import NextPlaneSchema
 from service.use_cases import Posterior
 
 

@@ -14,6 +14,7 @@ from service import use_cases
 from service.observability import StageTimer
 from service.ports import RECONSTRUCTION_JOB, MeshFormat, StoredResult
 from service.presentation import result_summary
+from service.request_schemas import ReconstructionForm, parse_labels
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithServices, address
 from service.routes.job_requests import (
@@ -29,7 +30,7 @@ from service.routes.meshes import mesh_bytes
 from service.routes.multipart import require_multipart
 from service.routes.negotiation import negotiate
 from service.routes.responses import DIRECT_FORMATS, JSON, MESH_MEDIA_TYPES, attachment, files, problems
-from service.schemas import ReconstructionForm, ResultSummary, parse_labels
+from service.schemas import ResultSummary
 
 PATH = "/v1/reconstructions"
 _OFFERED = {JSON: None, **{MESH_MEDIA_TYPES[format]: format for format in DIRECT_FORMATS}}

@@ -10,12 +10,13 @@ from starlette.responses import JSONResponse, Response
 from service import use_cases
 from service.ports import StoredResult
 from service.presentation import result_summary
+from service.request_schemas import MeshQuery, UncertaintyQuery, VolumeQuery
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithServices, WithTicket, address
 from service.routes.meshes import mesh_bytes
 from service.routes.reconstructions import PATH
 from service.routes.responses import JSON, MESH_MEDIA_TYPES, NIFTI, Responses, attachment, files, problems
-from service.schemas import MeshQuery, ResultSummary, SurfaceSd, UncertaintyQuery, VolumeQuery
+from service.schemas import ResultSummary, SurfaceSd
 from service.use_cases import Volume
 
 Identifier = Annotated[

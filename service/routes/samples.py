@@ -14,12 +14,12 @@ from model.inference.reconstruction import Watch
 from service import use_cases
 from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, make_sample, manifest_bytes
 from service.ports import SampleFormat, Ticket
+from service.request_schemas import BatchQuery, SampleQuery, Seed
 from service.routes.caching import cached, caching_headers, is_held, not_modified
 from service.routes.connection import in_order, run_while_connected
 from service.routes.dependencies import Services, WithModel, WithServices, WithTicket
 from service.routes.models import PATH
 from service.routes.responses import ZIP, attachment, files, problems, sample_media_type
-from service.schemas import BatchQuery, SampleQuery, Seed
 
 
 def samples_router() -> APIRouter:

@@ -9,8 +9,9 @@ from service.app import interface_document
 from service.cli import build_app
 from service.errors import KINDS, PROTOCOL_KINDS
 from service.ports import MeshFormat, SampleFormat
+from service.request_schemas import ReconstructionForm
 from service.routes.responses import DIRECT_FORMATS, MESH_MEDIA_TYPES
-from service.schemas import ReconstructionForm, ResultSummary
+from service.schemas import ResultSummary
 from service.settings import SETTINGS_FILE_VARIABLE, Settings
 from tests.contract.test_openapi import operations
 from training.cli import register

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from model.errors import InvalidParameter
 from service.job_schemas import JobForm
 from service.jobs.tools import options_of
-from service.schemas import ReconstructionForm
+from service.request_schemas import ReconstructionForm
 
 FILE = UploadFile(io.BytesIO(b""))
 CHOICES = st.fixed_dictionaries(

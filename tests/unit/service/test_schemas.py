@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from model.errors import InvalidParameter
 from model.inference.observations import Plane
-from service.schemas import parse_annotated, parse_labels
+from service.request_schemas import parse_annotated, parse_labels
 
 planes = st.lists(
     st.builds(Plane, st.integers(0, 9), st.integers(0, 2), st.integers(0, 10_000)), min_size=1, max_size=5

@@ -1,0 +1,183 @@
+"""Wire types of what the HTTP interface is asked: forms, queries and their parameters. They stop at the routes."""
+
+import json
+from typing import Annotated, Literal
+
+from fastapi import UploadFile
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from model.errors import InvalidParameter
+from model.inference.calipers import USUAL_TEXT, parse_extents
+from model.inference.next_plane import Among
+from model.inference.observations import AnnotatedRule, Plane
+from model.inference.reconstruction import Options
+from service.ports import MeshFormat, SampleFormat
+from service.use_cases import MAX_SEED
+
+SpacingMm = Annotated[float, Field(ge=0.25, le=10.0, allow_inf_nan=False, description="grid step (mm)")]
+#: Description of the part `extents`.
+EXTENTS = (
+    "extents of the surface to measure, separated by commas: R, A and S along the axes of the world, longest between "
+    "any two points, or a direction as three numbers with blanks between them, such as 0.5 0 0.87"
+)
+Seed = Annotated[int, Field(ge=0, le=MAX_SEED, description="makes the answer repeatable")]
+
+
+class _Closed(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class ReconstructionForm(_Closed):
+    """The parts of a reconstruction request."""
+
+    mask: list[UploadFile] = Field(
+        min_length=1,
+        description="sparse segmentation (NIfTI, NRRD, seg.nrrd, MetaImage, DICOM SEG or RTSTRUCT); several files are "
+        "several stacks of the same object, each with its own grid; the first one's grid is the input's grid",
+    )
+    model: str | None = Field(None, description="model name; may be left out when only one is loaded")
+    label: list[str] = Field(
+        default_factory=list,
+        description="label value or values of the object, repeated or separated by commas; all non-zero when left out",
+    )
+    annotated: str = Field(
+        "auto",
+        description='auto, all, nonempty, or a JSON list of planes such as [{"stack": 0, "axis": 2, "index": 7}]',
+    )
+    uncertainty: Literal["laplace", "ensemble", "none"] = Field("laplace", description="how uncertainty is found")
+    mirror: Literal["auto", "never", "always"] = Field("never", description="whether left and right are exchanged")
+    resolution_mm: SpacingMm | None = Field(
+        None, description="grid step of the surface (mm); the model's when left out"
+    )
+    seed: Seed = 0
+    fidelity: float | None = Field(
+        None,
+        ge=0.0,
+        le=1.0,
+        description="0 trusts the model, 1 trusts the slices: share of what the model leaves unexplained on the slices "
+        "that the surface follows; the one calibrated for the model when left out",
+    )
+    extents: str = Field(USUAL_TEXT, description=EXTENTS)
+
+    def options(self) -> Options:
+        """The choices as domain types."""
+        annotated = parse_annotated(self.annotated)
+        choices = self.uncertainty, self.mirror, self.resolution_mm, self.seed, self.fidelity
+        return Options(annotated, *choices, parse_extents(self.extents))
+
+
+class PlanesForm(_Closed):
+    """The parts of a request for annotated planes."""
+
+    mask: list[UploadFile] = Field(min_length=1, description="as of a reconstruction")
+    label: list[str] = Field(default_factory=list, description="as of a reconstruction")
+    annotated: str = Field("auto", description="as of a reconstruction")
+
+
+class ComparisonQuery(_Closed):
+    """Query of a comparison."""
+
+    other: str = Field(description="identifier of the result that is compared with")
+    format: Literal["ply", "glb", "vtp", "mz3"] = Field("ply", description="file format")
+
+
+class MeshQuery(_Closed):
+    """Query of a mesh."""
+
+    format: MeshFormat = Field(MeshFormat.PLY, description="file format")
+    max_error_mm: float = Field(
+        0.0, ge=0.0, le=10.0, description="fewer triangles, none of them farther than this (mm) from the full surface"
+    )
+
+
+class VolumeQuery(_Closed):
+    """Query of a volume."""
+
+    spacing_mm: SpacingMm | None = Field(None, description="grid step (mm); the input's grid when left out")
+
+
+class UncertaintyQuery(VolumeQuery):
+    """Query of an uncertainty."""
+
+    kind: Literal["entropy", "surface_sd"] = Field(
+        "entropy", description="voxel entropy (nats, NIfTI) or standard deviation of the surface (mm, JSON)"
+    )
+
+
+class PosteriorQuery(_Closed):
+    """Query of shapes from the posterior."""
+
+    format: MeshFormat = Field(MeshFormat.PLY, description="file format")
+    count: int = Field(16, ge=1, description="how many; larger than the service's limit is refused with 413")
+    seed: Seed = 0
+    spacing_mm: SpacingMm | None = Field(None, description="grid step (mm); that of the result when left out")
+
+
+class NextPlaneQuery(_Closed):
+    """Query of the plane to draw next."""
+
+    planes: Among = Field(
+        "grid",
+        description="which planes compete: grid (those of the input's grid, along all three axes) or free (any)",
+    )
+
+
+class SampleQuery(_Closed):
+    """Query of one synthetic shape."""
+
+    format: SampleFormat = Field(SampleFormat.STL, description="file format")
+    temperature: float = Field(
+        1.0, gt=0.0, le=2.0, allow_inf_nan=False, description="spread of the shapes; 1 is the population's"
+    )
+    spacing_mm: SpacingMm | None = Field(None, description="grid step (mm); the model's when left out")
+    reject: bool = Field(
+        True, description="draw anew where a shape is implausible: not one component, or of a volume out of range"
+    )
+
+
+class BatchQuery(SampleQuery):
+    """Query of a batch of synthetic shapes."""
+
+    count: int = Field(16, ge=1, description="how many; larger than the service's limit is refused with 413")
+    seed: Seed = 0
+
+
+class PlaneSchema(_Closed):
+    """A plane of voxels."""
+
+    stack: int = Field(ge=0, description="number of the mask part")
+    axis: int = Field(ge=0, le=2, description="voxel axis that the plane is perpendicular to")
+    index: int = Field(ge=0, description="voxel index along the axis")
+
+
+def parse_annotated(text: str) -> AnnotatedRule | tuple[Plane, ...]:
+    """The `annotated` parameter.
+
+    Raises:
+        InvalidParameter: neither a rule nor a JSON list of planes.
+    """
+    match text.strip():
+        case "auto" | "all" | "nonempty" as rule:
+            return rule
+    try:
+        planes = [PlaneSchema.model_validate(item, strict=True) for item in json.loads(text)]
+    except (ValueError, TypeError, RecursionError, ValidationError):
+        planes = []
+    if not planes:
+        accepted = 'auto, all, nonempty or a JSON list of planes such as [{"stack": 0, "axis": 2, "index": 7}]'
+        raise InvalidParameter(f"The parameter annotated must be {accepted}.", part="annotated")
+    return tuple(Plane(plane.stack, plane.axis, plane.index) for plane in planes)
+
+
+def parse_labels(texts: list[str]) -> frozenset[int] | None:
+    """The `label` parameter: repeated, separated by commas, or not there.
+
+    Raises:
+        InvalidParameter: not whole numbers from 1 to 65535.
+    """
+    words = [word.strip() for text in texts for word in text.split(",") if text.strip()]
+    if not words:
+        return None
+    if not all(word.isascii() and word.isdecimal() and len(word) <= 5 and 1 <= int(word) <= 65535 for word in words):
+        raise InvalidParameter("The parameter label must be whole numbers from 1 to 65535.", part="label")
+    return frozenset(map(int, words))
