@@ -48,7 +48,7 @@ def rounds():
     """Right requests to every operation, and wrong ones to those that can be asked wrongly."""
     for method, path, operation in operations(interface_document()):
         if path.startswith("/dicom-web/"):
-            continue  # no generator makes multipart/related; tests/integration/test_pacs.py asks them
+            continue  # no generator makes multipart/related; tests/integration/test_pacs_listeners.py asks them
         yield method, path, GenerationMode.POSITIVE
         kinds = [parameter["schema"].get("type") for parameter in operation.get("parameters", [])]
         if "requestBody" in operation or set(kinds) - {"string"}:

@@ -1,155 +1,33 @@
 """Drawings and results between a real archive (Orthanc) and the job, by every way that the service speaks."""
 
-import gc
-import io
 import json
 import os
-import shutil
-import ssl
 import subprocess
 import sys
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 
-import httpx
 import pytest
-from pydicom import Dataset, dcmread
-from pynetdicom import AE
 
-from benchmarks.pacs.orthanc import Orthanc, is_installed, running_orthanc, send
+from benchmarks.pacs.orthanc import is_installed
 from benchmarks.ports import free_ports
 from service.adapters.blobs import FolderBlobs
 from service.adapters.dicom.results import RESULTS
-from service.adapters.image_guard import ImageLimits
-from service.adapters.jobs.client import DbosJobs
-from service.adapters.jobs.worker import WorkerOptions, running_worker
 from service.adapters.pacs.archives import open_archive
-from service.adapters.pacs.audit import AuditTrail, broken_line
-from service.adapters.pacs.configuration import Archive, Listener, MoveDestination, PacsConfiguration, Rule, Tls
-from service.adapters.pacs.delivery import Desk
-from service.adapters.pacs.dimse_client import DimseArchive
-from service.adapters.pacs.dimse_server import dimse_listener
-from service.adapters.pacs.inbox import INBOX, OBJECT, QUARANTINE, Inbox
-from service.jobs.drawings import DrawingTools, drawing_kind
-from service.model_registry import ModelRegistry
-from service.observability import make_log
-from service.pacs import silence_libraries
+from service.adapters.pacs.audit import broken_line
+from service.adapters.pacs.configuration import Archive
+from service.adapters.pacs.inbox import QUARANTINE
 from service.pacs_ports import Disposition
-from tests.analytic_model import ellipsoid_model
 from tests.dicom_parts import PATIENT_ID, PATIENT_NAME, file_bytes, mr_series, reread, ring, rtstruct_of, seg_of
-from tests.service_parts import app_for, running, sparse_ellipsoid
+from tests.pacs_parts import PATIENCE_S, by_dicomweb, by_get, by_move, new_study, results_in, service_with
+from tests.service_parts import sparse_ellipsoid
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.usefixtures("sockets_of_refused_peers"),
     pytest.mark.skipif(not is_installed(), reason="Orthanc is not installed (Debian: orthanc orthanc-dicomweb dcmtk)"),
 ]
-PATIENCE_S = 60.0
-
-
-@pytest.fixture(autouse=True, scope="module")
-def sockets_of_refused_peers():
-    """pynetdicom leaves the socket of a peer that was cut off to the garbage collector, which reports it anywhere."""
-    yield
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)
-        gc.collect()
-
-
-@dataclass(frozen=True)
-class Ports:
-    http: int
-    dicom: int
-    own: int
-
-
-@pytest.fixture(scope="module")
-def ports() -> Ports:
-    http, dicom, own, _ = free_ports(4)
-    return Ports(http, dicom, own)
-
-
-@pytest.fixture(scope="module")
-def orthanc(tmp_path_factory, ports) -> Iterator[Orthanc]:
-    folder = tmp_path_factory.mktemp("orthanc")
-    with running_orthanc(folder, (ports.http, ports.dicom), ports.own, ports.own + 1, "do end") as found:
-        yield found
-
-
-@dataclass
-class Service:
-    """The receiver, its files, and a worker on demand."""
-
-    folder: Path
-    configuration: PacsConfiguration
-    said: io.StringIO
-
-    def __post_init__(self) -> None:
-        silence_libraries()
-        self.blobs = FolderBlobs(self.folder / "files")
-        self.url = f"sqlite:///{self.folder / 'jobs.sqlite'}"
-        self.jobs = DbosJobs(self.url)
-        self.audit = AuditTrail(self.folder / "audit.jsonl")
-        self.log = make_log("debug", self.said)
-        self.inbox = Inbox(self.configuration.rules, self.blobs, self.jobs, self.audit, "MORPHOFLOW", self.log)
-
-    @contextmanager
-    def working(self) -> Iterator[None]:
-        registry = ModelRegistry({"ellipsoid": ellipsoid_model("ellipsoid")})
-        desk = Desk(self.configuration, self.blobs, self.audit, partial(open_archive, blobs=self.blobs), "MORPHOFLOW")
-        limits = ImageLimits(max_bytes=1 << 24, max_voxels=1 << 22)
-        kind = drawing_kind(DrawingTools(desk, registry, limits, "0.1.0", self.log))
-        with running_worker([kind], WorkerOptions(self.url, "a-0"), self.log):
-            yield
-
-    def until_empty(self) -> None:
-        limit = time.monotonic() + PATIENCE_S
-        while self.inbox.backlog() and time.monotonic() < limit:
-            time.sleep(0.05)
-        assert self.inbox.backlog() == 0
-
-
-def by_dicomweb(orthanc: Orthanc) -> Archive:
-    return Archive(name="archive", dicomweb=orthanc.dicomweb)
-
-
-def by_get(orthanc: Orthanc) -> Archive:
-    return Archive(name="archive", ae_title="ORTHANC", port=orthanc.dicom_port)
-
-
-def by_move(orthanc: Orthanc, own: int) -> Archive:
-    return replace_archive(by_get(orthanc), move=MoveDestination(ae_title="MORPHOMOVE", port=own + 1))
-
-
-def replace_archive(archive: Archive, **changes) -> Archive:
-    return archive.model_copy(update=changes)
-
-
-def service_with(folder: Path, archive: Archive, **changes) -> Service:
-    rule = Rule(name="all", model="ellipsoid", fetch_from="archive", send_to=("archive",), **changes)
-    configuration = PacsConfiguration(archives=(archive,), rules=(rule,), retry_first_s=0.1, retry_longest_s=0.5)
-    return Service(folder, configuration, io.StringIO())
-
-
-def new_study(orthanc: Orthanc, folder: Path) -> tuple[list[Dataset], Dataset]:
-    """Images in the archive, and a drawing on them."""
-    images = mr_series()
-    (folder / "images").mkdir(exist_ok=True)
-    for number, image in enumerate(images):
-        (folder / "images" / f"{number}.dcm").write_bytes(file_bytes(image))
-    send(folder / "images", orthanc.dicom_port)
-    drawn, _ = sparse_ellipsoid()
-    return images, seg_of(images, drawn)
-
-
-def results_in(orthanc: Orthanc, study: str) -> list[Dataset]:
-    found = [dcmread(io.BytesIO(orthanc.file(item["ID"]))) for item in orthanc.instances(study)]
-    return [item for item in found if item.get("Manufacturer") == "MorphoFlow"]
-
 
 WAYS = {"DICOMweb": by_dicomweb, "C-GET": by_get}
 
@@ -321,7 +199,7 @@ from benchmarks.pacs.orthanc import Orthanc
 from service.adapters.pacs.configuration import Archive
 from service.adapters.pacs.delivery import Desk
 from service.adapters.blobs import FolderBlobs
-from tests.integration.test_pacs import service_with
+from tests.pacs_parts import service_with
 place, moment, address = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
 name, _, when = moment.partition(" ")
 def deadly(owner, name):
@@ -357,7 +235,7 @@ RECEIVED = """
 import os, signal, sys
 from pathlib import Path
 from service.adapters.pacs.configuration import Archive
-from tests.integration.test_pacs import service_with
+from tests.pacs_parts import service_with
 service = service_with(Path(sys.argv[1]), Archive(name="archive", dicomweb=sys.argv[3]))
 service.inbox.receive(Path(sys.argv[2]).read_bytes(), "VIEWER")
 os.kill(os.getpid(), signal.SIGKILL)
@@ -389,125 +267,3 @@ def test_what_was_written_down_before_a_kill_is_taken_up(orthanc, tmp_path):
     with again.working():
         again.until_empty()
     assert len(results_in(orthanc, images[0].StudyInstanceUID)) == len(RESULTS)
-
-
-@contextmanager
-def listening(service: Service, listener: Listener) -> Iterator[None]:
-    with dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log):
-        yield
-
-
-def associate(port: int, caller: str, called: str = "MORPHOFLOW", **more):
-    entity = AE(ae_title=caller)
-    entity.add_requested_context("1.2.840.10008.1.1")
-    entity.add_requested_context("1.2.840.10008.5.1.4.1.1.66.4")
-    return entity.associate("127.0.0.1", port, ae_title=called, **more)
-
-
-def test_only_listed_callers_are_heard(orthanc, tmp_path):
-    service = service_with(tmp_path, by_dicomweb(orthanc))
-    (port,) = free_ports(1)
-    with listening(service, Listener(port=port, calling_ae_titles=("VIEWER",))):
-        peer = associate(port, "VIEWER")
-        assert peer.is_established
-        assert peer.send_c_echo().Status == 0
-        peer.release()
-        assert associate(port, "STRANGER").is_rejected
-        assert associate(port, "VIEWER", "ANOTHER").is_rejected
-    assert "STRANGER" in (tmp_path / "audit.jsonl").read_text()
-
-
-def test_storescu_is_acknowledged_when_the_object_is_on_disk(orthanc, tmp_path):
-    _, drawing = new_study(orthanc, tmp_path)
-    service = service_with(tmp_path, by_dicomweb(orthanc))
-    (port,) = free_ports(1)
-    path = tmp_path / "drawing.dcm"
-    path.write_bytes(file_bytes(drawing))
-    with listening(service, Listener(port=port, calling_ae_titles=("VIEWER",))):
-        send([path], port, "MORPHOFLOW", "VIEWER")
-    (key,) = [key for key in service.blobs.list(f"{INBOX}/") if key.endswith(OBJECT)]
-    kept = dcmread(io.BytesIO(service.blobs.get(key)))
-    assert kept.SOPInstanceUID == drawing.SOPInstanceUID
-    assert kept.PixelData == drawing.PixelData
-
-
-def test_storage_commitment_is_asked_for_and_reported(orthanc, ports, tmp_path):
-    images, _ = new_study(orthanc, tmp_path)
-    service = service_with(tmp_path, by_dicomweb(orthanc))
-    archive = DimseArchive(replace_archive(by_get(orthanc), commitment=True), service.blobs)
-    with listening(service, Listener(port=ports.own, calling_ae_titles=("ORTHANC",))):
-        assert archive.holds(images[:3])
-        unknown = mr_series()[:1]
-        assert not archive.holds(unknown)
-    assert archive.echo()
-
-
-@pytest.fixture
-def certificates(tmp_path) -> Tls:
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl is not installed")
-    tls = Tls(certificate=tmp_path / "own.pem", key=tmp_path / "own.key", authorities=tmp_path / "own.pem")
-    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost"]
-    names = ["-addext", "subjectAltName=IP:127.0.0.1,DNS:localhost"]
-    subprocess.run([*command, *names, "-keyout", tls.key, "-out", tls.certificate], check=True, capture_output=True)
-    return tls
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the library's refused socket
-def test_associations_over_tls_need_a_certificate(orthanc, tmp_path, certificates):
-    service = service_with(tmp_path, by_dicomweb(orthanc))
-    (port,) = free_ports(1)
-    with listening(service, Listener(port=port, calling_ae_titles=("MORPHOFLOW",), tls=certificates)):
-        peer = Archive(name="peer", ae_title="MORPHOFLOW", port=port, tls=certificates)
-        assert DimseArchive(peer, service.blobs).echo()
-        assert not associate(port, "MORPHOFLOW").is_established
-        bare = ssl.create_default_context(cafile=str(certificates.authorities))
-        stranger = associate(port, "MORPHOFLOW", tls_args=(bare, "127.0.0.1"))
-        if stranger.is_established:
-            stranger.send_c_echo()
-        assert not stranger.is_established
-    del stranger
-    time.sleep(1)  # the library's threads let go of the refused sockets
-    gc.collect()
-
-
-@pytest.fixture
-def pacs_file(orthanc, tmp_path) -> Path:
-    path = tmp_path / "pacs.toml"
-    path.write_text(
-        f'[[archives]]\nname = "archive"\ndicomweb = "{orthanc.dicomweb}"\n'
-        '[[rules]]\nname = "all"\nmodel = "ellipsoid"\nfetch_from = "archive"\nsend_to = ["archive"]\n'
-        'senders = ["STOW-RS"]\n'
-    )
-    return path
-
-
-def stow(client: httpx.Client, *objects: bytes, path: str = "/dicom-web/studies") -> httpx.Response:
-    parts = b"".join(b"--b\r\nContent-Type: application/dicom\r\n\r\n" + data + b"\r\n" for data in objects)
-    kind = 'multipart/related; type="application/dicom"; boundary=b'
-    return client.post(path, content=parts + b"--b--\r\n", headers={"content-type": kind})
-
-
-def test_stow_answers_for_each_object(orthanc, tmp_path, pacs_file):
-    images, drawing = new_study(orthanc, tmp_path)
-    with running(app_for(tmp_path, pacs_file=pacs_file)) as client:
-        taken = stow(client, file_bytes(drawing), file_bytes(images[0]))
-        assert taken.status_code == 200
-        assert taken.headers["content-type"] == "application/dicom+json"
-        assert len(taken.json()["00081199"]["Value"]) == 2
-        some = stow(client, file_bytes(drawing), b"nonsense", path=f"/dicom-web/studies/{drawing.StudyInstanceUID}")
-        assert some.status_code == 202
-        assert some.json()["00081198"]["Value"][0]["00081197"]["Value"] == [0xC000]
-        assert stow(client, b"nonsense").status_code == 409
-        assert "morphoflow_dicom_backlog 1.0" in client.get("/metrics").text
-        assert "morphoflow_dicom_quarantined 1.0" in client.get("/metrics").text
-        torn = client.post(
-            "/dicom-web/studies", content=b"--b\r\n", headers={"content-type": taken.request.headers["content-type"]}
-        )
-        assert torn.status_code == 415
-        assert client.post("/dicom-web/studies", json={}).status_code == 415
-
-
-def test_without_the_file_nothing_is_taken(tmp_path):
-    with running(app_for(tmp_path)) as client:
-        assert stow(client, b"").status_code == 404

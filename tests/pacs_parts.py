@@ -1,0 +1,109 @@
+"""A receiver beside a real archive (Orthanc): its files, a worker on demand, studies and results."""
+
+import io
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from pydicom import Dataset, dcmread
+
+from benchmarks.pacs.orthanc import Orthanc, send
+from service.adapters.blobs import FolderBlobs
+from service.adapters.image_guard import ImageLimits
+from service.adapters.jobs.client import DbosJobs
+from service.adapters.jobs.worker import WorkerOptions, running_worker
+from service.adapters.pacs.archives import open_archive
+from service.adapters.pacs.audit import AuditTrail
+from service.adapters.pacs.configuration import Archive, MoveDestination, PacsConfiguration, Rule
+from service.adapters.pacs.delivery import Desk
+from service.adapters.pacs.inbox import Inbox
+from service.jobs.drawings import DrawingTools, drawing_kind
+from service.model_registry import ModelRegistry
+from service.observability import make_log
+from service.pacs import silence_libraries
+from tests.analytic_model import ellipsoid_model
+from tests.dicom_parts import file_bytes, mr_series, seg_of
+from tests.service_parts import sparse_ellipsoid
+
+PATIENCE_S = 60.0
+
+
+@dataclass(frozen=True)
+class Ports:
+    http: int
+    dicom: int
+    own: int
+
+
+@dataclass
+class Service:
+    """The receiver, its files, and a worker on demand."""
+
+    folder: Path
+    configuration: PacsConfiguration
+    said: io.StringIO
+
+    def __post_init__(self) -> None:
+        silence_libraries()
+        self.blobs = FolderBlobs(self.folder / "files")
+        self.url = f"sqlite:///{self.folder / 'jobs.sqlite'}"
+        self.jobs = DbosJobs(self.url)
+        self.audit = AuditTrail(self.folder / "audit.jsonl")
+        self.log = make_log("debug", self.said)
+        self.inbox = Inbox(self.configuration.rules, self.blobs, self.jobs, self.audit, "MORPHOFLOW", self.log)
+
+    @contextmanager
+    def working(self) -> Iterator[None]:
+        registry = ModelRegistry({"ellipsoid": ellipsoid_model("ellipsoid")})
+        desk = Desk(self.configuration, self.blobs, self.audit, partial(open_archive, blobs=self.blobs), "MORPHOFLOW")
+        limits = ImageLimits(max_bytes=1 << 24, max_voxels=1 << 22)
+        kind = drawing_kind(DrawingTools(desk, registry, limits, "0.1.0", self.log))
+        with running_worker([kind], WorkerOptions(self.url, "a-0"), self.log):
+            yield
+
+    def until_empty(self) -> None:
+        limit = time.monotonic() + PATIENCE_S
+        while self.inbox.backlog() and time.monotonic() < limit:
+            time.sleep(0.05)
+        assert self.inbox.backlog() == 0
+
+
+def by_dicomweb(orthanc: Orthanc) -> Archive:
+    return Archive(name="archive", dicomweb=orthanc.dicomweb)
+
+
+def by_get(orthanc: Orthanc) -> Archive:
+    return Archive(name="archive", ae_title="ORTHANC", port=orthanc.dicom_port)
+
+
+def by_move(orthanc: Orthanc, own: int) -> Archive:
+    return replace_archive(by_get(orthanc), move=MoveDestination(ae_title="MORPHOMOVE", port=own + 1))
+
+
+def replace_archive(archive: Archive, **changes) -> Archive:
+    return archive.model_copy(update=changes)
+
+
+def service_with(folder: Path, archive: Archive, **changes) -> Service:
+    rule = Rule(name="all", model="ellipsoid", fetch_from="archive", send_to=("archive",), **changes)
+    configuration = PacsConfiguration(archives=(archive,), rules=(rule,), retry_first_s=0.1, retry_longest_s=0.5)
+    return Service(folder, configuration, io.StringIO())
+
+
+def new_study(orthanc: Orthanc, folder: Path) -> tuple[list[Dataset], Dataset]:
+    """Images in the archive, and a drawing on them."""
+    images = mr_series()
+    (folder / "images").mkdir(exist_ok=True)
+    for number, image in enumerate(images):
+        (folder / "images" / f"{number}.dcm").write_bytes(file_bytes(image))
+    send(folder / "images", orthanc.dicom_port)
+    drawn, _ = sparse_ellipsoid()
+    return images, seg_of(images, drawn)
+
+
+def results_in(orthanc: Orthanc, study: str) -> list[Dataset]:
+    found = [dcmread(io.BytesIO(orthanc.file(item["ID"]))) for item in orthanc.instances(study)]
+    return [item for item in found if item.get("Manufacturer") == "MorphoFlow"]
