@@ -19,22 +19,25 @@ SHARES = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 PARTS = 5
 
 
-def shrunk_covariance(codes: Codes, target: Float[Tensor, "d d"]) -> tuple[Float[Tensor, "d d"], float]:
-    """Covariance of Gaussian codes, shrunk towards the target.
+def shrunk_covariance(
+    codes: Codes, target: Float[Tensor, "d d"], least: float = 0.0
+) -> tuple[Float[Tensor, "d d"], float]:
+    """Covariance of Gaussian codes, shrunk towards the target by at least this share.
 
     Returns:
         The covariance in double precision, and the target's share in it.
     """
-    scores = dict.fromkeys(SHARES, 0.0)
+    shares = [share for share in SHARES if share >= least]
+    scores = dict.fromkeys(shares, 0.0)
     for part in range(PARTS):
         out = codes.group % PARTS == part
         if not out.any() or out.all():
             continue
         centre, covariance = _moments(codes.of(~out))
         scatter = _scatter(codes.of(out), centre) * out.sum()
-        for share in SHARES:
+        for share in shares:
             scores[share] += _log_density(_mixed(covariance, target, share), scatter, int(out.sum()))
-    best = max(SHARES, key=lambda share: scores[share])
+    best = max(shares, key=lambda share: scores[share])
     return _mixed(_moments(codes)[1], target, best), best
 
 

@@ -136,6 +136,7 @@ def base_moments(found):
 class TestRefitted:
     def test_the_base_is_the_standard_normal_of_the_codes(self, monkeypatch):
         monkeypatch.setattr("training.shrinkage.SHARES", (0.0,))
+        monkeypatch.setattr("training.pruning.LEAST_OF_TRAINING", 0.0)
         found = refitted(module_of(), SHAPES, HALF_MM, PriorParts(flow=False))
         mean, covariance = base_moments(found)
         size = len(found.prior.sigma)

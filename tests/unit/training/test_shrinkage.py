@@ -52,6 +52,12 @@ def expected(covariance, truth):
     return -0.5 * float(torch.logdet(covariance) + torch.linalg.solve(covariance, truth).trace())
 
 
+@pytest.mark.parametrize("least", [0.1, 0.5, 1.0])
+def test_no_less_of_the_target_than_is_asked_for(truth, least):
+    _, share = shrunk_covariance(codes_of(5000, truth, 0), torch.eye(SIZE), least)
+    assert share == least
+
+
 def test_widths_of_the_codes_count():
     """Points in one place with a width of one have the unit covariance."""
     codes = Codes(torch.zeros(30, SIZE), torch.ones(30, SIZE), torch.arange(30))
