@@ -38,8 +38,8 @@ LEAST_NATS = 0.02
 LEAST_SHARE = 0.02
 #: Principal movements below this share of the largest are left out unless a caller says otherwise.
 LEAST_MOVEMENT = 0.01
-#: The prior of the training keeps at least this share of the codes' covariance. Codes that were left out would be more
-#: probable with less of it, but shapes are reconstructed from few slices better with more.
+#: A prior that stood still in the training keeps at least this share of the codes' covariance. Codes that were left out
+#: would be more probable with less of it, but shapes are reconstructed from few slices better with more.
 LEAST_OF_TRAINING = 0.5
 
 
@@ -145,7 +145,8 @@ def refitted(
     if not module.random:
         return less
     codes, target = live_codes(module, less, shapes)
-    covariance, share = shrunk_covariance(codes, target, LEAST_OF_TRAINING)
+    least_share = 0.0 if module.config.prior.use_ard else LEAST_OF_TRAINING
+    covariance, share = shrunk_covariance(codes, target, least_share)
     with torch.no_grad():
         axes = principal_axes(less.decoder, codes.mean, covariance, half_extent_mm)
         least = parts.least_movement if parts.ard else 0.0

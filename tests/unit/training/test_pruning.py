@@ -11,18 +11,26 @@ from model.networks.prior import PriorShape
 from tests.random_networks import randomise
 from training.autodecoder import AutoDecoder
 from training.config import ObjectiveConfig, TrainingConfig
-from training.pruning import LEAST_MOVEMENT, LEAST_NATS, PriorParts, divergences, pruned, refitted
+from training.pruning import (
+    LEAST_MOVEMENT,
+    LEAST_NATS,
+    LEAST_OF_TRAINING,
+    PriorParts,
+    divergences,
+    pruned,
+    refitted,
+)
 
 SIZE, SHAPES = 6, 20
 LIVE = [0, 2, 3, 5]
 
 
-def module_of(*, transforms=1, objective="variational", live=LIVE, seed=0):
+def module_of(*, transforms=1, objective="variational", live=LIVE, seed=0, ard=True):
     """A random module whose codes say nothing along the other dimensions."""
     torch.manual_seed(seed)
     config = TrainingConfig(
         decoder=DecoderShape(latent_size=SIZE, width=16, depth=3),
-        prior=PriorShape(FlowShape(latent_size=SIZE, transforms=transforms, bins=3, width=12)),
+        prior=PriorShape(FlowShape(latent_size=SIZE, transforms=transforms, bins=3, width=12), use_ard=ard),
         objective=ObjectiveConfig(name=objective),
     )
     module = AutoDecoder(config, SHAPES)
@@ -136,7 +144,6 @@ def base_moments(found):
 class TestRefitted:
     def test_the_base_is_the_standard_normal_of_the_codes(self, monkeypatch):
         monkeypatch.setattr("training.shrinkage.SHARES", (0.0,))
-        monkeypatch.setattr("training.pruning.LEAST_OF_TRAINING", 0.0)
         found = refitted(module_of(), SHAPES, HALF_MM, PriorParts(flow=False))
         mean, covariance = base_moments(found)
         size = len(found.prior.sigma)
@@ -174,6 +181,9 @@ class TestRefitted:
     @pytest.mark.parametrize("flow", [True, False])
     def test_a_flow_is_there_when_it_is_asked_for(self, flow):
         assert refitted(module_of(), SHAPES, HALF_MM, PriorParts(flow=flow)).prior.shape.use_flow is flow
+
+    def test_half_of_a_prior_that_stood_still_stays(self):
+        assert refitted(module_of(ard=False), SHAPES, HALF_MM).shrinkage >= LEAST_OF_TRAINING
 
     def test_points_are_only_pruned(self):
         found = refitted(module_of(objective="paper"), SHAPES, HALF_MM)
