@@ -125,6 +125,9 @@ def export(
     least_movement: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="With pruning: what moves less than this share of the most goes.")
     ] = 0.01,
+    training_share: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="With pruning: the least that stays of the prior of the training.")
+    ] = 0.5,
     resolution_mm: Annotated[
         float, typer.Option(min=0.25, max=10.0, help="Grid step of surfaces (mm) unless a request names another.")
     ] = 1.0,
@@ -139,12 +142,13 @@ def export(
         from training.release import default_parts, export_run
 
         wanted = default_parts(run) is not None if prune is None else prune
+        parts = PriorParts(least_movement=least_movement, least_of_training=training_share)
         manifest = export_run(
             run,
             output,
             name=name,
             version=version,
-            parts=PriorParts(least_movement=least_movement) if wanted else None,
+            parts=parts if wanted else None,
             anatomy=anatomy_code(anatomy),
             resolution_mm=resolution_mm,
         )

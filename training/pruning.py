@@ -38,8 +38,8 @@ LEAST_NATS = 0.02
 LEAST_SHARE = 0.02
 #: Principal movements below this share of the largest are left out unless a caller says otherwise.
 LEAST_MOVEMENT = 0.01
-#: A prior that stood still in the training keeps at least this share of the codes' covariance. Codes that were left out
-#: would be more probable with less of it, but shapes are reconstructed from few slices better with more.
+#: What the prior of the training keeps of the covariance unless a caller says otherwise. Codes that were left out would
+#: be more probable with less of it, but most shapes are reconstructed from few slices better with more.
 LEAST_OF_TRAINING = 0.5
 
 
@@ -51,11 +51,13 @@ class PriorParts:
         flow: whether there is a flow; the base is the prior otherwise.
         ard: whether irrelevant dimensions are left out; all stay otherwise.
         least_movement: a dimension is irrelevant whose principal movement is below this share of the largest.
+        least_of_training: a prior that stood still in the training keeps at least this share of the codes' covariance.
     """
 
     flow: bool = True
     ard: bool = True
     least_movement: float = LEAST_MOVEMENT
+    least_of_training: float = LEAST_OF_TRAINING
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ def refitted(
     if not module.random:
         return less
     codes, target = live_codes(module, less, shapes)
-    least_share = 0.0 if module.config.prior.use_ard else LEAST_OF_TRAINING
+    least_share = 0.0 if module.config.prior.use_ard else parts.least_of_training
     covariance, share = shrunk_covariance(codes, target, least_share)
     with torch.no_grad():
         axes = principal_axes(less.decoder, codes.mean, covariance, half_extent_mm)

@@ -152,7 +152,12 @@ class TestRefitted:
         assert (torch.linalg.eigvalsh(covariance) < 1.0 + 1e-3).all()
         assert float(covariance.diag().mean()) > 0.5
         assert (found.prior.sigma.diff() <= 0).all()
-        assert found.facts()["fitted"] == {"flow": False, "ard": True, "least_movement": LEAST_MOVEMENT}
+        assert found.facts()["fitted"] == {
+            "flow": False,
+            "ard": True,
+            "least_movement": LEAST_MOVEMENT,
+            "least_of_training": LEAST_OF_TRAINING,
+        }
 
     def test_the_field_is_that_of_the_trained_decoder_at_the_same_codes(self):
         module = module_of()
@@ -183,7 +188,9 @@ class TestRefitted:
         assert refitted(module_of(), SHAPES, HALF_MM, PriorParts(flow=flow)).prior.shape.use_flow is flow
 
     def test_half_of_a_prior_that_stood_still_stays(self):
-        assert refitted(module_of(ard=False), SHAPES, HALF_MM).shrinkage >= LEAST_OF_TRAINING
+        module = module_of(ard=False)
+        assert refitted(module, SHAPES, HALF_MM).shrinkage >= LEAST_OF_TRAINING
+        assert refitted(module, SHAPES, HALF_MM, PriorParts(least_of_training=1.0)).shrinkage == 1.0
 
     def test_points_are_only_pruned(self):
         found = refitted(module_of(objective="paper"), SHAPES, HALF_MM)
