@@ -4,7 +4,7 @@ Starts the service with its shipped models in a process of its own, sends sparse
 the surface (binary STL) from the answer. Masks are drawn from a cohort's test cases, three orthogonal slices and every
 8th axial slice, or read from a file. The first request of each kind is not counted.
 
-    python -m benchmarks.request --model hippocampus --cohort hippocampus --data ../shared/data
+    python -m benchmarks.request --cohort hippocampus --data ../shared/data
     python -m benchmarks.request --mask docs/examples/hippocampus_three_slices.nii.gz
 """
 
@@ -53,7 +53,7 @@ class Timing:
 
 
 def main(
-    model: Annotated[str | None, typer.Option(help="Name of a loaded model; needed when several are.")] = None,
+    model: Annotated[str | None, typer.Option(help="Name of a loaded model; the cohort's when left out.")] = None,
     bundle: Annotated[list[Path] | None, typer.Option(help="Folder of a further bundle; may repeat.")] = None,
     cohort: Annotated[CohortName | None, typer.Option(help="Cohort whose test cases are drawn.")] = None,
     data: Annotated[Path | None, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = None,
@@ -68,7 +68,7 @@ def main(
     reference = matrix_rate()
     with serving(tuple(bundle or ())) as server:
         idle = server.peak_memory_mib()
-        timings = measure(server, postings, model, repeats, limit_s)
+        timings = measure(server, postings, model or (cohort or CohortName.HIPPOCAMPUS).value, repeats, limit_s)
         peak = server.peak_memory_mib()
     values = {
         "matrix_product_gflops": round(reference, 1),
@@ -89,16 +89,14 @@ def drawn_cases(cohort: CohortName, data: Path | None, count: int) -> Iterator[P
             yield Posting(regime, gzip.compress(image.to_bytes(), compresslevel=1))
 
 
-def measure(
-    server: Server, postings: Sequence[Posting], model: str | None, repeats: int, limit_s: float
-) -> list[Timing]:
+def measure(server: Server, postings: Sequence[Posting], model: str, repeats: int, limit_s: float) -> list[Timing]:
     """Every kind of request, in turn, until the time is over."""
     end = time.monotonic() + limit_s
     found = []
     for regime in dict.fromkeys(posting.regime for posting in postings):
         mine = [posting for posting in postings if posting.regime == regime]
         for uncertainty in UNCERTAINTIES:
-            form = {"uncertainty": uncertainty, **({"model": model} if model else {})}
+            form = {"uncertainty": uncertainty, "model": model}
             post(server.client, mine[0], form)
             seconds: list[float | None] = []
             for posting in [posting for _ in range(repeats) for posting in mine]:
