@@ -2,9 +2,10 @@
 
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -96,7 +97,7 @@ def run_cell(
     begin = time.perf_counter()
     if not place.is_exported:
         config = config_of(cell, cohort, effort, device, known=known)
-        if not is_finished(place.run, config):
+        if not is_finished(place.run, cohort, config):
             prepared(cohort, config, place.run).go(lambda step, _: watch("training", step, config.steps))
         _export(place, cohort, effort, parts_of(cell))
     model = open_bundle(place.bundle, threads=1)
@@ -146,7 +147,7 @@ def result_of(cell: Cell, model: ShapeModel, cohort: Cohort, effort: Effort, sec
         raise InvalidParameter(
             "The cohort has no test shapes; one with a test split, or --test-fraction, is accepted.", part="cohort"
         )
-    trained = trained_sigmas(model.manifest)
+    sigmas = relevance(model.manifest)
     drawn = generated(model, samples=effort.samples, watch=lambda number: watch("generating", number, effort.samples))
     return Result(
         key=cell.key,
@@ -162,8 +163,8 @@ def result_of(cell: Cell, model: ShapeModel, cohort: Cohort, effort: Effort, sec
         shapes=len(cohort.train),
         steps=steps_of(model.manifest),
         seconds=round(seconds, 1),
-        sigmas=sorted(trained, reverse=True),
-        active=list(active_dimensions(np.array(trained))),
+        sigmas=sorted(sigmas, reverse=True),
+        active=list(active_dimensions(np.array(sigmas))),
         latent=drawn.latent.round(4).tolist(),
         surface_mm=drawn.surface_mm.round(4).tolist(),
         measured={regime: _measured(model, cohort, regime, effort, watch) for regime in cell.measured_in},
@@ -176,11 +177,10 @@ def steps_of(manifest: Manifest) -> int:
     return int(config["steps"]) if isinstance(config, dict) else 0
 
 
-def trained_sigmas(manifest: Manifest) -> list[float]:
-    """Sigmas of all dimensions that were trained, dead ones among them."""
-    pruned = manifest.training.get("pruned")
-    known = pruned.get("trained_sigmas") if isinstance(pruned, Mapping) else None
-    return list(manifest.sigmas if known is None else known)
+def relevance(manifest: Manifest) -> list[float]:
+    """Sigmas by which dimensions are told relevant: of the prior that was fitted, else all that were trained."""
+    facts: Any = manifest.training.get("pruned") or {}
+    return list(facts["trained_sigmas"] if facts and not facts.get("fitted") else manifest.sigmas)
 
 
 def adopt(bundle: Path, place: Place) -> None:

@@ -176,7 +176,9 @@ class TestSweep:
         assert set(results) == {"plain", "flow-ard"}
         for one in results.values():
             assert list(one.measured["thin"]) == ["e6", "e7"]
-            assert len(one.sigmas) == 3
+            bundle = read_manifest(folder / "cells" / one.key / "bundle")[0]
+            assert one.sigmas == sorted(bundle.sigmas, reverse=True)
+        assert len(set(results["plain"].sigmas)) == 1 < len(set(results["flow-ard"].sigmas))
         assert len((folder / "results.csv").read_text().splitlines()) == 3
 
     def test_what_is_there_is_skipped(self, swept):
@@ -308,6 +310,15 @@ class TestSideBySide:
         train_side_by_side(plan)
         assert len(self.weights(tmp_path)) == 4
         assert all(path.stat().st_mtime_ns == time for path, time in times.items())
+
+    def test_a_training_of_other_masks_is_not_taken_for_finished(self, masks, tmp_path):
+        shutil.copytree(masks, tmp_path / "masks")
+        plan = self.plan(tmp_path / "masks", tmp_path / "sweep")
+        train_side_by_side(plan)
+        nib.save(nib.Nifti1Image(ellipsoid(9).astype(np.uint8), np.eye(4)), tmp_path / "masks" / "train" / "e0.nii.gz")
+        work(plan)
+        assert len(refusals(plan)) == len(plan.cells)
+        assert done(plan.folder) == set()
 
     def test_the_workers_record_why_one_is_refused(self, masks, tmp_path):
         train_side_by_side(self.plan(masks, tmp_path))
