@@ -111,7 +111,8 @@ def serve(
     require_protection(settings)
     registry = context.obj(settings)
     helping = settings.model_copy(update={"threads": settings.threads or 1})
-    typer.echo(f"Try it from another terminal:\n\n  {example_request(settings, registry.names())}\n", err=True)
+    example = example_request(settings, registry.names())
+    typer.echo(f"A request from another terminal, with a mask file of yours:\n\n  {example}\n", err=True)
     with (
         spread(settings.workers - 1, partial(load_registry, helping)) as compute,
         supervised_workers(settings.job_workers, make_log(settings.log_level)),
