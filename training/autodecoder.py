@@ -1,9 +1,10 @@
 """Training of decoder, prior and one latent code a shape (auto-decoder, Park et al. 2019)."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -119,15 +120,16 @@ class Trainer:
     def advance(self, *, read: bool = True) -> dict[str, float]:
         """One optimiser step; returns its figures, or none when they are not to be read from the device."""
         self._schedule()
-        terms = self._descend()
+        terms = self._advance_module()
         self.step += 1
         return {name: value.item() for name, value in terms.items()} if read else {}
 
     def _make_ready(self) -> None:
         on_gpu = self.pool.device.type == "cuda"
-        self._descend = RecordedStep(self._descent, self.generator) if on_gpu else self._descent
+        self._advance_module = RecordedStep(self.update, self.generator) if on_gpu else self.update
 
-    def _descent(self) -> dict[str, Tensor]:
+    def update(self) -> dict[str, Tensor]:
+        """Draw points, descend once; the figures stay on the device and nothing waits for it."""
         config = self.config
         size = min(config.batch_shapes, self.pool.size)
         chosen = torch.randperm(self.pool.size, generator=self.generator, device=self.pool.device)[:size]
@@ -141,7 +143,7 @@ class Trainer:
 
     def at_end(self) -> bool:
         """Whether the last step was made, or an earlier one was found to be the last."""
-        return self.finished or self.step >= self.config.steps
+        return is_ended({"step": self.step, "finished": self.finished}, self.config)
 
     def _schedule(self) -> None:
         progress = self.step / self.config.steps
@@ -177,6 +179,11 @@ class Trainer:
         self.step = state["step"]
         self.finished = bool(state.get("finished", False))
         self._make_ready()
+
+
+def is_ended(state: Mapping[str, Any], config: TrainingConfig) -> bool:
+    """Whether a checkpoint is that of a run whose last step was made, or an earlier one was found to be the last."""
+    return bool(state.get("finished", False)) or state["step"] >= config.steps
 
 
 def _optimiser(module: AutoDecoder, config: TrainingConfig) -> torch.optim.Optimizer:

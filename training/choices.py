@@ -13,8 +13,11 @@ if TYPE_CHECKING:
 BATCH_SHARE, BATCH_RANGE = 4, (32, 128)
 #: Points of a step, and at most of a shape; three quarters of them near its contour.
 STEP_POINTS, MOST_POINTS = 8192, 256
-
-
+#: Principal movements below this share of the largest are left out unless a caller says otherwise.
+LEAST_MOVEMENT = 0.01
+#: What the prior of the training keeps of the covariance unless a caller says otherwise. Codes that were left out would
+#: be more probable with less of it, but most shapes are reconstructed from few slices better with more.
+LEAST_OF_TRAINING = 0.5
 #: Validations of a run with early stopping.
 VALIDATIONS = 20
 

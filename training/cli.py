@@ -13,6 +13,8 @@ import typer
 
 from model.errors import InvalidParameter
 from training.choices import (
+    LEAST_MOVEMENT,
+    LEAST_OF_TRAINING,
     DeviceName,
     ObjectiveName,
     RegimeName,
@@ -61,11 +63,11 @@ def train(
     epochs: Annotated[int | None, typer.Option(min=1, help="Passes over the cohort, in place of --steps.")] = None,
     flow: Annotated[
         bool | None,
-        typer.Option("--flow/--no-flow", help="Whether a flow is trained along; export fits one unless objectives do."),
+        typer.Option("--flow/--no-flow", help="Whether a flow is trained along, and not fitted by export."),
     ] = None,
     ard: Annotated[
         bool | None,
-        typer.Option("--ard/--no-ard", help="Whether relevance is determined along; export does it otherwise."),
+        typer.Option("--ard/--no-ard", help="Whether ARD acts along, and not when exporting."),
     ] = None,
     ard_weight: Annotated[
         float | None, typer.Option(min=0.0, help="Of --ard; more leaves fewer dimensions alive.")
@@ -124,10 +126,10 @@ def export(
     ] = None,
     least_movement: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="With pruning: what moves less than this share of the most goes.")
-    ] = 0.01,
+    ] = LEAST_MOVEMENT,
     training_share: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="With pruning: the least that stays of the prior of the training.")
-    ] = 0.5,
+    ] = LEAST_OF_TRAINING,
     resolution_mm: Annotated[
         float, typer.Option(min=0.25, max=10.0, help="Grid step of surfaces (mm) unless a request names another.")
     ] = 1.0,
@@ -139,16 +141,16 @@ def export(
     """Export a run as a bundle that the service loads."""
     with exit_status():
         from training.pruning import PriorParts
-        from training.release import default_parts, export_run
+        from training.release import export_run, wants_prior
 
-        wanted = default_parts(run) is not None if prune is None else prune
+        fitted = wants_prior(run) if prune is None else prune
         parts = PriorParts(least_movement=least_movement, least_of_training=training_share)
         manifest = export_run(
             run,
             output,
             name=name,
             version=version,
-            parts=parts if wanted else None,
+            parts=parts if fitted else None,
             anatomy=anatomy_code(anatomy),
             resolution_mm=resolution_mm,
         )

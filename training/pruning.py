@@ -28,6 +28,7 @@ from model.networks.flow import MaskedLinear, SplineTransform
 from model.networks.prior import LatentPrior
 from model.networks.splines import parameter_count
 from training.autodecoder import AutoDecoder
+from training.choices import LEAST_MOVEMENT, LEAST_OF_TRAINING
 from training.principal import principal_axes, turned_decoder
 from training.prior_fit import Codes, fitted_prior
 from training.shrinkage import shrunk_covariance
@@ -36,11 +37,6 @@ from training.shrinkage import shrunk_covariance
 LEAST_NATS = 0.02
 #: So is one whose sigma, or standard deviation of the codes where these are points, is below this share of the largest.
 LEAST_SHARE = 0.02
-#: Principal movements below this share of the largest are left out unless a caller says otherwise.
-LEAST_MOVEMENT = 0.01
-#: What the prior of the training keeps of the covariance unless a caller says otherwise. Codes that were left out would
-#: be more probable with less of it, but most shapes are reconstructed from few slices better with more.
-LEAST_OF_TRAINING = 0.5
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from model.bundle import POPULATION, Manifest, write_manifest
 from model.errors import InvalidParameter
 from model.networks.export import export_graphs
 from model.networks.prior import LatentPrior
-from training.autodecoder import AutoDecoder
+from training.autodecoder import AutoDecoder, is_ended
 from training.config import TrainingConfig
 from training.pruning import PriorParts, refitted
 from training.runs import CHECKPOINT, read_record
@@ -109,7 +109,7 @@ def load_module(run: Path, config: TrainingConfig, shapes: int) -> AutoDecoder:
     """
     path = run / CHECKPOINT
     state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True) if path.is_file() else {"step": 0}
-    if state["step"] < config.steps and not state.get("finished", False):
+    if not is_ended(state, config):
         raise InvalidParameter(
             f"The run stands at step {state['step']} of {config.steps}; a finished run is accepted, see --resume.",
             part="run",
@@ -119,15 +119,14 @@ def load_module(run: Path, config: TrainingConfig, shapes: int) -> AutoDecoder:
     return module.eval()
 
 
-def default_parts(run: Path) -> PriorParts | None:
-    """What is fitted to a run's codes unless a caller says otherwise: all, if they are Gaussians and nothing was yet.
+def wants_prior(run: Path) -> bool:
+    """Whether a run's codes are Gaussians that no flow and no ARD was trained along with: export fits both to them.
 
     Raises:
         InvalidParameter: the folder holds no run.
     """
     config, _ = read_record(run)
-    trained = config.prior.use_flow or config.prior.use_ard
-    return None if trained or config.objective.name == "paper" else PriorParts()
+    return config.objective.name != "paper" and not (config.prior.use_flow or config.prior.use_ard)
 
 
 def write_population(

@@ -12,7 +12,7 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from model.errors import InvalidParameter
-from training.autodecoder import AutoDecoder, Trainer, train
+from training.autodecoder import AutoDecoder, Trainer, is_ended, train
 from training.cohorts.cohort import Case, Cohort
 from training.config import TrainingConfig, config_from_dict
 from training.points import cohort_points, decoder_extent
@@ -82,16 +82,17 @@ def train_cohort(
     return prepare(cohort, config, folder, resume=resume).go(watch)
 
 
-def is_finished(folder: Path, config: TrainingConfig) -> bool:
-    """Whether the folder holds a run of this configuration, on whatever device, that has reached its end."""
+def is_finished(folder: Path, cohort: Cohort, config: TrainingConfig) -> bool:
+    """Whether the folder holds a run of these masks and settings, on whatever device, that has reached its end."""
     if not (folder / CHECKPOINT).is_file() or not (folder / RECORD).is_file():
         return False
-    there, _ = read_record(folder)
+    there, values = read_record(folder)
     decoder = replace(config.decoder, extent_mm=there.decoder.extent_mm)
-    if there != replace(config, decoder=decoder, device=there.device):
+    wanted = record(cohort, replace(config, decoder=decoder, device=there.device))
+    if not _is_of(values, there, wanted):
         return False
     state = torch.load(folder / CHECKPOINT, map_location="cpu", weights_only=True, mmap=True)
-    return bool(state.get("finished", False)) or state["step"] >= there.steps
+    return is_ended(state, there)
 
 
 def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
@@ -152,13 +153,17 @@ def _check_folder(folder: Path, wanted: dict[str, Any], *, resume: bool) -> None
             "The output folder holds a run already; an empty folder, or --resume, is accepted.", part="output"
         )
     config, there = read_record(folder)
-    # A field that the configuration did not have then counts with its default.
-    known = {**there, "config": json.loads(json.dumps(config.as_dict()))}
-    if known != json.loads(json.dumps(wanted)):
+    if not _is_of(there, config, wanted):
         raise InvalidParameter(
             "The run in the output folder was made of other masks or settings; the same ones are accepted.",
             part="resume",
         )
+
+
+def _is_of(values: dict[str, Any], config: TrainingConfig, wanted: dict[str, Any]) -> bool:
+    """Whether a record that was read is the one that is wanted; fields that were not there yet have their defaults."""
+    known = {**values, "config": json.loads(json.dumps(config.as_dict()))}
+    return bool(known == json.loads(json.dumps(wanted)))
 
 
 def _validating_watch(

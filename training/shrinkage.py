@@ -22,10 +22,15 @@ PARTS = 5
 def shrunk_covariance(
     codes: Codes, target: Float[Tensor, "d d"], least: float = 0.0
 ) -> tuple[Float[Tensor, "d d"], float]:
-    """Covariance of Gaussian codes, shrunk towards the target by at least this share.
+    """Covariance of Gaussian codes, shrunk towards a target.
+
+    Args:
+        codes: along their coordinates; those of one group are left out together.
+        target: (d, d) positive definite, in the squared units of the codes.
+        least: share of the target at least, from 0 to 1.
 
     Returns:
-        The covariance in double precision, and the target's share in it.
+        The (d, d) covariance in double precision, and the target's share in it.
     """
     shares = [share for share in SHARES if share >= least]
     scores = dict.fromkeys(shares, 0.0)

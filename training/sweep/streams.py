@@ -64,7 +64,7 @@ def _next_run(sweep: Sweep, key: str, cell: Cell, cohorts: Cohorts, holding: Exi
     cohort, known = cohorts.of(cell), sweep.source.cohort is not None
     config = config_of(cell, cohort, sweep.effort, sweep.device, known=known)
     try:
-        return None if is_finished(place.run, config) else prepared(cohort, config, place.run)
+        return None if is_finished(place.run, cohort, config) else prepared(cohort, config, place.run)
     except MorphoFlowError:
         return None
 

@@ -10,11 +10,10 @@ from model.networks.flow import FlowShape
 from model.networks.prior import PriorShape
 from tests.random_networks import randomise
 from training.autodecoder import AutoDecoder
+from training.choices import LEAST_MOVEMENT, LEAST_OF_TRAINING
 from training.config import ObjectiveConfig, TrainingConfig
 from training.pruning import (
-    LEAST_MOVEMENT,
     LEAST_NATS,
-    LEAST_OF_TRAINING,
     PriorParts,
     divergences,
     pruned,

@@ -42,7 +42,7 @@ def weights(trainer: Trainer) -> dict[str, torch.Tensor]:
 
 def test_replays_change_the_parameters_as_the_step_itself_does():
     recorded, plain = (Trainer.start(CONFIG, balls(8)) for _ in range(2))
-    plain._descend = plain._descent
+    plain._advance_module = plain.update
     for _ in range(CONFIG.steps):
         one, other = recorded.advance(), plain.advance()
         assert one == pytest.approx(other, rel=1e-3, abs=1e-4)

@@ -1,4 +1,5 @@
 import hashlib
+import json
 import logging
 from dataclasses import replace
 
@@ -13,11 +14,12 @@ from model.networks.flow import FlowShape
 from model.networks.prior import PriorShape
 from tests.ellipsoid_cohort import GRID, ellipsoids
 from training.autodecoder import AutoDecoder
+from training.choices import DeviceName, ObjectiveName, RegimeName, configured
 from training.cohorts import Case, Cohort, Provenance
 from training.config import TrainingConfig
 from training.pruning import PriorParts
-from training.release import active_dimensions, export_run, load_module
-from training.runs import half_extent, read_record, train_cohort
+from training.release import active_dimensions, export_run, load_module, wants_prior
+from training.runs import RECORD, half_extent, read_record, train_cohort
 
 CONFIG = TrainingConfig(
     decoder=DecoderShape(latent_size=3, width=8, depth=2),
@@ -130,3 +132,22 @@ def test_a_loaded_module_is_ready_for_inference(run):
     assert isinstance(module, AutoDecoder)
     assert not module.training
     assert module.mean.shape == (4, 3)
+
+
+@pytest.mark.parametrize(
+    ("objective", "flow", "ard", "wanted"),
+    [
+        (ObjectiveName.VARIATIONAL, None, None, True),
+        (ObjectiveName.VARIATIONAL, True, None, False),
+        (ObjectiveName.VARIATIONAL, None, True, False),
+        (ObjectiveName.CENTRED, None, None, False),
+        (ObjectiveName.CENTRED, False, False, True),
+        (ObjectiveName.PAPER, False, False, False),
+    ],
+)
+def test_export_fits_the_prior_that_was_not_trained_along(tmp_path, objective, flow, ard, wanted):
+    config = configured(
+        objective, RegimeName.DENSE, 3, flow=flow, ard=ard, reflected=False, seed=0, device=DeviceName.CPU
+    )
+    (tmp_path / RECORD).write_text(json.dumps({"config": config.as_dict()}))
+    assert wants_prior(tmp_path) is wanted
