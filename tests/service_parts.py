@@ -1,5 +1,6 @@
 """What tests of the service share: a running server over the analytic model, masks of ellipsoids, outcomes."""
 
+import gzip
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -168,3 +169,16 @@ def gated_model() -> tuple[ShapeModel, GatedDecoder]:
     """The analytic model behind a gate."""
     decoder = GatedDecoder()
     return replace(ellipsoid_model(NAME), decoder=decoder), decoder
+
+
+def image(response):
+    """The NIfTI file of an answer."""
+    assert response.status_code == 200
+    return nib.Nifti1Image.from_bytes(gzip.decompress(response.content))
+
+
+def problem(response, status):
+    """What an answer of this status says went wrong."""
+    assert response.status_code == status
+    assert response.headers["content-type"] == "application/problem+json"
+    return response.json()

@@ -16,16 +16,10 @@ from service.model_registry import BrokenModel, ModelRegistry
 from service.observability import make_log
 from tests.analytic_model import EllipsoidDecoder, ellipsoid_model
 from tests.bad_inputs import SECRET
-from tests.service_parts import NAME, app_for, gated_model, mask_parts, running, settings_for
+from tests.service_parts import NAME, app_for, gated_model, mask_parts, problem, running, settings_for
 
 RECONSTRUCTIONS = "/v1/reconstructions"
 SAMPLES = f"/v1/models/{NAME}/samples"
-
-
-def problem(response, status):
-    assert response.status_code == status
-    assert response.headers["content-type"] == "application/problem+json"
-    return response.json()
 
 
 def chunks(size, count):
