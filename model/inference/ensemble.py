@@ -1,19 +1,27 @@
 """Ensemble of refits from different slice configurations and starting points (MorphoFlow paper, section 3)."""
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
 
 from model.bundle import ShapeModel
-from model.inference.fitting import Fit, FitOptions, fit_together
-from model.inference.objective import LinearPrior, Place, reweighted
+from model.geometry import POSE_SIZE
+from model.inference.descent import descend
+from model.inference.fitting import Fit, FitOptions, fit_of
+from model.inference.objective import LinearPrior, Objective, Place, reweighted
 from model.inference.observations import Observations, thinned
+from model.inference.posterior import laplace_covariance
 
 #: Members of an ensemble, as in the paper.
 MEMBERS = 25
-#: Members end at this predicted decrease (nats), far below the spread between them.
-TOLERANCE = 0.3
+#: Members end at this predicted decrease (nats), below the spread between them; the last step is still taken.
+TOLERANCE = 1.0
 #: Members see one observation of so many.
-EVERY = 3
+EVERY = 2
+#: Starts are spread about the predicted optima by this share of the posterior SD.
+START_SPREAD = 0.5
 
 
 def fit_ensemble(
@@ -21,20 +29,35 @@ def fit_ensemble(
 ) -> tuple[Fit, ...]:
     """Refits under random weights of the planes (Bayesian bootstrap, Rubin 1981), each from a random start.
 
-    Members advance side by side; planes that the fit left out stay out. The starting pose is the fit's; the starting
-    code is drawn around the fit's by half a prior SD of the flow's base.
+    Members advance side by side; planes that the fit left out stay out. What each plane says at the fit tells to
+    second order where a member will end; it starts around there.
     """
     random = np.random.default_rng(seed)
-    sigmas = np.asarray(model.manifest.sigmas)
-    base = model.prior.to_base(found.latent[None]) + 0.5 * sigmas * random.standard_normal((members, len(sigmas)))
     planes = len(observations.planes)
     shares = [random.dirichlet(np.ones(planes)) * planes * _trust(found, planes) for _ in range(members)]
     fewer = thinned(observations, EVERY, seed=seed)
-    weighted = [reweighted(fewer, share) for share in shares]
-    starts = [Place(latent, found.pose) for latent in model.prior.from_base(base)]
     options = FitOptions(robust=False, tolerance=TOLERANCE)
     tangent = LinearPrior.around(model.prior, found.latent).base_jacobian
-    return tuple(fit_together(model, weighted, starts, options, coarse_sharpness=1.0, coarse_prior=tangent))
+    predicted = _predicted(Objective(model, fewer, found.pose, options, tangent), found, shares)
+    spread = START_SPREAD * np.linalg.cholesky(laplace_covariance(found))
+    starts = [_moved(found, step + spread @ random.standard_normal(len(step))) for step in predicted]
+    objectives = [Objective(model, reweighted(fewer, share), found.pose, options, tangent) for share in shares]
+    return tuple(fit_of(problem) for problem in descend(objectives, starts, 1.0, options))
+
+
+def _predicted(
+    objective: Objective, found: Fit, shares: Sequence[Float[np.ndarray, "k"]]
+) -> Iterator[Float[np.ndarray, "p"]]:
+    """Newton's step from the fit to the optimum under each weighting of the planes."""
+    here = _moved(found, np.zeros(len(found.precision)))
+    terms = objective.by_plane(here)
+    for share in shares:
+        point = objective.gathered(here, [term.times(part) for term, part in zip(terms, share, strict=True)])
+        yield -cho_solve(cho_factor(point.curvature), point.gradient)
+
+
+def _moved(found: Fit, step: Float[np.ndarray, "p"]) -> Place:
+    return Place(found.latent + step[:-POSE_SIZE], found.pose.moved(step[-POSE_SIZE:]))
 
 
 def _trust(found: Fit, planes: int) -> Float[np.ndarray, "k"]:

@@ -18,7 +18,7 @@ from model.geometry import Pose
 from model.inference.descent import Descent, Referee, descend
 from model.inference.fit_types import Fit, FitOptions, FitStatus, MirrorRule
 from model.inference.leave_out import contradicting_plane, most_wrong
-from model.inference.objective import BaseJacobian, Objective, Place, pose_offset, reweighted
+from model.inference.objective import Objective, Place, pose_offset, reweighted
 from model.inference.observations import Observations, thinned
 
 __all__ = [
@@ -28,7 +28,7 @@ __all__ = [
     "MirrorRule",
     "fit",
     "fit_from",
-    "fit_together",
+    "fit_of",
     "pose_offset",
     "refit",
     "searched",
@@ -93,7 +93,7 @@ def _without_wrong_planes(
 def _from_place(model: ShapeModel, observations: Observations, found: Fit, start: Pose, options: FitOptions) -> Fit:
     """Go on from another fit, with the pose's prior around a start."""
     objective = Objective(model, observations, replace(start, mirrored=found.pose.mirrored), options)
-    return _fit(descend([objective], [Place(found.latent, found.pose)], 1.0, options)[0], found.iterations)
+    return fit_of(descend([objective], [Place(found.latent, found.pose)], 1.0, options)[0], found.iterations)
 
 
 def refit(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Fit:
@@ -161,37 +161,15 @@ def fit_from(
 ) -> Fit:
     """Fit from one starting pose, and one starting code (the centre of the latent space when None)."""
     code = np.zeros(model.manifest.latent_size) if latent is None else latent
-    return fit_together(model, [observations], [Place(code, start)], options)[0]
-
-
-def fit_together(
-    model: ShapeModel,
-    observations: Sequence[Observations],
-    starts: Sequence[Place],
-    options: FitOptions,
-    coarse_sharpness: float = COARSE_SHARPNESS,
-    coarse_prior: BaseJacobian | None = None,
-) -> list[Fit]:
-    """Fits side by side, each to observations of its own (as many in each) from a place of its own.
-
-    Args:
-        coarse_sharpness: of the first stage; 1 when the starts are near the optimum.
-        coarse_prior: the prior that the first stage sees; the model's when None.
-    """
-    coarse = _coarse(model, observations, starts, options, coarse_sharpness, base_jacobian=coarse_prior)
-    fine = descend(
-        [Objective(model, one, start.pose, options) for one, start in zip(observations, starts, strict=True)],
-        [_place(one) for one in coarse],
-        1.0,
-        options,
-    )
-    return [_fit(last, first.iterations) for first, last in zip(coarse, fine, strict=True)]
+    (coarse,) = _coarse(model, observations, [Place(code, start)], options)
+    (fine,) = descend([Objective(model, observations, start, options)], [_place(coarse)], 1.0, options)
+    return fit_of(fine, coarse.iterations)
 
 
 def _from_starts(model: ShapeModel, observations: Observations, poses: Sequence[Pose], options: FitOptions) -> Fit:
     """The best of the fits from several poses; those that fall behind early are not finished."""
     starts = [Place(np.zeros(model.manifest.latent_size), pose) for pose in poses]
-    coarse = _coarse(model, [observations] * len(starts), starts, options, COARSE_SHARPNESS, _give_up_those_behind)
+    coarse = _coarse(model, observations, starts, options, _give_up_those_behind)
     last = _limit(coarse, BEHIND_SHARE[1])
     rest = [number for number, one in enumerate(coarse) if one.point.value <= last]
     fine = descend(
@@ -201,24 +179,22 @@ def _from_starts(model: ShapeModel, observations: Observations, poses: Sequence[
         options,
     )
     best = min(range(len(rest)), key=lambda place: fine[place].point.value)
-    return _fit(fine[best], coarse[rest[best]].iterations)
+    return fit_of(fine[best], coarse[rest[best]].iterations)
 
 
 def _coarse(
     model: ShapeModel,
-    observations: Sequence[Observations],
+    observations: Observations,
     starts: Sequence[Place],
     options: FitOptions,
-    sharpness: float,
     referee: Referee = lambda problems: None,
-    base_jacobian: BaseJacobian | None = None,
 ) -> list[Descent]:
-    """The first stage: blunt logits on few observations."""
-    rough = [thinned(one, _coarse_step(len(one.points)), seed=0) for one in observations]
+    """The first stage, from all starts side by side: blunt logits on few observations."""
+    rough = thinned(observations, _coarse_step(len(observations.points)), seed=0)
     return descend(
-        [Objective(model, one, start.pose, options, base_jacobian) for one, start in zip(rough, starts, strict=True)],
+        [Objective(model, rough, start.pose, options) for start in starts],
         starts,
-        sharpness,
+        COARSE_SHARPNESS,
         replace(options, tolerance=COARSE_TOLERANCE, max_iterations=COARSE_ITERATIONS),
         referee,
     )
@@ -244,7 +220,8 @@ def _place(problem: Descent) -> Place:
     return Place(problem.point.latent, problem.point.pose)
 
 
-def _fit(problem: Descent, iterations_before: int) -> Fit:
+def fit_of(problem: Descent, iterations_before: int = 0) -> Fit:
+    """What a descent found."""
     point, status = problem.point, problem.status or FitStatus.ITERATION_LIMIT
     return Fit(
         point.latent,

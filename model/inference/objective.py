@@ -87,6 +87,10 @@ class DataTerm:
     gradient: Float[np.ndarray, "p"]
     curvature: Float[np.ndarray, "p p"]
 
+    def times(self, share: float) -> "DataTerm":
+        """The term of the same observations with other weights."""
+        return DataTerm(share * self.value, share * self.expected, share * self.gradient, share * self.curvature)
+
 
 class Objective:
     """The negative log posterior of one model, one set of observations and one starting pose."""

@@ -7,12 +7,10 @@ the discrepancy is observed anew at them and a draw of it added. An ensemble's d
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from model.bundle import ShapeModel
-from model.geometry import Pose
+from model.inference.discrepancy.conditioning import observed_anew
 from model.inference.discrepancy.draws import drawn
-from model.inference.discrepancy.process import REACH_MM, Discrepancy
 from model.inference.fitting import Fit
 from model.inference.mesh import Mesh
 from model.inference.surface import surface_of
@@ -59,20 +57,8 @@ def _around(model: ShapeModel, state: ShapeState, seed: int) -> Fit:
     scale, offset = calibrated_scale(model)
     step = scale * vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
     latent, pose = found.latent + step[:-7], found.pose.moved(step[-7:])
-    if found.discrepancy is None:
+    held = observed_anew(model, found, latent, pose)
+    if held is None:
         return replace(found, latent=latent, pose=pose)
-    held = _observed_anew(model, found, found.discrepancy, latent, pose)
     shift = offset * float(random.standard_normal())
     return replace(found, latent=latent, pose=pose, discrepancy=drawn(held, int(random.integers(2**32)), scale, shift))
-
-
-def _observed_anew(
-    model: ShapeModel, found: Fit, discrepancy: Discrepancy, latent: Float[np.ndarray, "d"], pose: Pose
-) -> Discrepancy:
-    """The discrepancy at the same contours, seen from another code and pose."""
-    world = found.pose.to_world(discrepancy.points)
-    moved = pose.to_canonical(world)
-    scale = REACH_MM * discrepancy.slope
-    before = np.tanh(model.decoder.logits(found.latent[None], discrepancy.points[None])[0] / scale)
-    after = np.tanh(model.decoder.logits(latent[None], moved[None])[0] / scale)
-    return replace(discrepancy, points=moved, residuals=discrepancy.residuals + REACH_MM * (before - after))

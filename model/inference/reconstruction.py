@@ -12,7 +12,7 @@ from model.errors import InvalidMask, InvalidParameter
 from model.inference.agreement import disagreeing_planes, plane_warnings, sections_of
 from model.inference.calipers import USUAL_EXTENTS, Extent, direction_of, measure_extents
 from model.inference.coverage import coverage_warnings
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, corrected, discrepancy_prior
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, corrected, discrepancy_prior, observed_anew
 from model.inference.ensemble import fit_ensemble
 from model.inference.estimates import Estimate
 from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
@@ -136,11 +136,7 @@ def reconstruct(
     watch("fit")
     usual = discrepancy_prior(model.manifest)
     model, settled, observations = _settled(model, stacks, drawing, FitOptions(mirror=options.mirror), usual)
-
-    def correct(fit: Fit) -> Fit:
-        return corrected(model, fit, stacks, drawing, discrepancy_prior(model.manifest, options.fidelity))
-
-    found = correct(settled)
+    found = corrected(model, settled, stacks, drawing, discrepancy_prior(model.manifest, options.fidelity))
     watch("surface")
     mesh = surface_of(model, found.latent, found.pose, options.resolution_mm, found.discrepancy)
     if mesh.is_empty:
@@ -150,7 +146,7 @@ def reconstruct(
             part="mask",
         )
     watch("uncertainty")
-    state = _state(model, observations, found, options, correct)
+    state = _state(model, observations, found, options)
     spread = surface_spread(model, state, mesh)
     sd_mm = None if spread is None else spread.sd()
     if sd_mm is not None:
@@ -213,13 +209,12 @@ def _check(options: Options) -> None:
         raise InvalidParameter(f"seed is {options.seed}; a whole number from 0 is accepted.", part="seed")
 
 
-def _state(
-    model: ShapeModel, observations: Observations, found: Fit, options: Options, correct: Callable[[Fit], Fit]
-) -> ShapeState:
-    """The fit and its posterior; the members of an ensemble are corrected by the drawing as the fit was."""
+def _state(model: ShapeModel, observations: Observations, found: Fit, options: Options) -> ShapeState:
+    """The fit and its posterior; the contours hold the members of an ensemble as they hold the fit."""
     if options.uncertainty == "ensemble":
         members = fit_ensemble(model, observations, found, options.seed)
-        return ShapeState((found, *map(correct, members)), None)
+        held = (replace(one, discrepancy=observed_anew(model, found, one.latent, one.pose)) for one in members)
+        return ShapeState((found, *held), None)
     return ShapeState((found,), laplace_covariance(found) if options.uncertainty == "laplace" else None)
 
 

@@ -14,6 +14,7 @@ from model.bundle import ShapeModel
 from model.geometry import Grid
 from model.inference.estimates import Estimate, estimate_of
 from model.inference.fitting import Fit
+from model.inference.member_moves import member_moves
 from model.inference.mesh import Mesh, area_cm2, area_gradient, vertex_areas, volume_ml
 from model.inference.posterior import (
     fitted_jacobians,
@@ -59,9 +60,7 @@ def surface_spread(model: ShapeModel, state: ShapeState, mesh: Mesh) -> SurfaceS
             factors = np.hstack([factors, np.full((len(factors), 1), offset)])
         return SurfaceSpread(factors, _local_spread(found, mesh, by_point, scale))
     if state.members:
-        _, _, by_point = fitted_jacobians(model, found, mesh.vertices)
-        logits = np.stack([fitted_logits(model, member, mesh.vertices) for member in state.members], axis=1)
-        moves = normal_displacements(logits, by_point)
+        moves = member_moves(model, found, state.members, mesh)
         return SurfaceSpread((moves - moves.mean(axis=1, keepdims=True)) / np.sqrt(len(state.members) - 1))
     return None
 

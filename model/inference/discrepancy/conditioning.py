@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from model.bundle import Manifest, ShapeModel
+from model.geometry import Pose
 from model.inference.discrepancy.contours import contour_points
 from model.inference.discrepancy.covariance import Covariance
 from model.inference.discrepancy.grouping import cells_of, means_of
@@ -110,6 +111,18 @@ def discrepancy_of(
         slope=slope,
         half_extent=canonical_box(model),
     )
+
+
+def observed_anew(model: ShapeModel, found: Fit, latent: Float[np.ndarray, "d"], pose: Pose) -> Discrepancy | None:
+    """The fit's discrepancy as it is from another code and pose, which the same contours hold; None without one."""
+    made = found.discrepancy
+    if made is None:
+        return None
+    moved = pose.to_canonical(found.pose.to_world(made.points))
+    scale = REACH_MM * made.slope
+    before = np.tanh(model.decoder.logits(found.latent[None], made.points[None])[0] / scale)
+    after = np.tanh(model.decoder.logits(latent[None], moved[None])[0] / scale)
+    return replace(made, points=moved, residuals=made.residuals + REACH_MM * (before - after))
 
 
 @dataclass(frozen=True)

@@ -76,6 +76,12 @@ class Discrepancy:
         """Posterior mean (mm); 0 outside the box."""
         return np.asarray(map_coordinates(self._splines, self._places(canonical), order=3, prefilter=False))
 
+    def means_of(
+        self, residuals: Float[np.ndarray, "n k"], canonical: Float[np.ndarray, "m 3"]
+    ) -> Float[np.ndarray, "m k"]:
+        """Posterior means (mm) had the process been observed to be these at its points, one set a column."""
+        return np.asarray(self.covariance.between(canonical, self.points) @ cho_solve(self._factor, residuals))
+
     def gradient(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
         """Gradient of the posterior mean, by central differences."""
         steps = DIFFERENCE_MM * np.eye(3)
