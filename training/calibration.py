@@ -18,11 +18,12 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from model.bundle import Manifest, ShapeModel, open_bundle, write_manifest
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_prior, with_discrepancy
 from model.inference.fitting import Fit, FitOptions, fit
-from model.inference.observations import observe
+from model.inference.observations import Observations, observe
 from model.inference.posterior import (
     fitted_jacobians,
+    fitted_logits,
     laplace_covariance,
     logit_variance,
     mean_probability,
@@ -33,7 +34,7 @@ from model.inference.thick_slices import through_thickness
 from training.cohorts.cohort import Case, Cohort
 from training.config import Regime
 from training.posterior_scale import posterior_scale
-from training.sparsify import for_evaluation
+from training.sparsify import Drawing, for_evaluation
 from training.usual import sound_answers, typical_figures, usual_figures
 
 #: Precisions that are tried (1/mm^2), fidelities, spreads (mm), and the regimes that they are tried on.
@@ -153,6 +154,36 @@ def with_precision(model: ShapeModel, precision: float) -> ShapeModel:
 
 def scores(model: ShapeModel, case: Case, regime: Regime) -> Iterator[tuple[Candidate, Score]]:
     """Score of each candidate on one drawing."""
+    seen = _fitted(model, case, regime)
+    for fidelity in FIDELITIES:
+        corrected = seen.corrected(model, DiscrepancyPrior(1.0, fidelity))
+        for spread, value in _scores_of(model, corrected, seen.points, seen.truth):
+            yield Candidate(model.manifest.likelihood_precision, fidelity, spread), value
+
+
+def wrong_share(model: ShapeModel, case: Case, regime: Regime) -> float:
+    """Share of the voxels near the true surface that the reconstruction of one drawing has on the wrong side."""
+    seen = _fitted(model, case, regime)
+    corrected = seen.corrected(model, discrepancy_prior(model.manifest))
+    return float(np.mean((fitted_logits(model, corrected, seen.points) > 0) != seen.truth))
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A fit to one drawing of a case, and voxels (world mm) near the true surface with their labels."""
+
+    drawing: Drawing
+    observations: Observations
+    found: Fit
+    points: Float[np.ndarray, "n 3"]
+    truth: Bool[np.ndarray, "n"]
+
+    def corrected(self, model: ShapeModel, prior: DiscrepancyPrior) -> Fit:
+        """The fit with its discrepancy."""
+        return with_discrepancy(model, self.found, [self.drawing.stack], self.observations, prior)
+
+
+def _fitted(model: ShapeModel, case: Case, regime: Regime) -> _Fitted:
     drawing = for_evaluation(case.mask, case.grid, regime)
     observations = observe(
         [drawing.stack], drawing.planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=0
@@ -163,11 +194,7 @@ def scores(model: ShapeModel, case: Case, regime: Regime) -> Iterator[tuple[Cand
     index = np.argwhere(near_surface(case.mask, case.grid.spacing))
     index = index[:: -(-len(index) // SCORED_VOXELS)]
     points, truth = case.grid.to_world(index.astype(float)), case.mask[tuple(index.T)]
-    for fidelity in FIDELITIES:
-        prior = DiscrepancyPrior(1.0, fidelity)
-        corrected = with_discrepancy(model, found, [drawing.stack], observations, prior)
-        for spread, value in _scores_of(model, corrected, points, truth):
-            yield Candidate(model.manifest.likelihood_precision, fidelity, spread), value
+    return _Fitted(drawing, observations, found, points, truth)
 
 
 def _scores_of(

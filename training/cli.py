@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from training.cohorts import Case
     from training.config import TrainingConfig
     from training.evaluate import Measurement
+    from training.pruning import PriorParts
     from training.sparsify import Regime
 
 
@@ -111,7 +112,10 @@ def train(
         _print_run(found, config, folder, figures, as_json=as_json)
 
 
+@takes_cohort
 def export(
+    source: CohortSource,
+    options: CohortOptions,
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
     output: Annotated[Path, typer.Option(help="Folder of the bundle; created.")],
     name: Annotated[str | None, typer.Option(help="Name of the model; the cohort's when left out.")] = None,
@@ -128,7 +132,13 @@ def export(
         float, typer.Option(min=0.0, max=1.0, help="With pruning: what moves less than this share of the most goes.")
     ] = LEAST_MOVEMENT,
     training_share: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="With pruning: the least that stays of the prior of the training.")
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="With pruning: the least that stays of the prior of the training; more where validation shapes of a "
+            "cohort that is named want it.",
+        ),
     ] = LEAST_OF_TRAINING,
     resolution_mm: Annotated[
         float, typer.Option(min=0.25, max=10.0, help="Grid step of surfaces (mm) unless a request names another.")
@@ -145,6 +155,8 @@ def export(
 
         fitted = wants_prior(run) if prune is None else prune
         parts = PriorParts(least_movement=least_movement, least_of_training=training_share)
+        if fitted and wants_prior(run) and source.is_given:
+            parts = _parts_for(run, parts, source, options)
         manifest = export_run(
             run,
             output,
@@ -161,6 +173,22 @@ def export(
             "dimensions": manifest.latent_size,
         }
         typer.echo(json.dumps(summary) if as_json else f"{manifest.name} {manifest.version} written to {output}")
+
+
+def _parts_for(run: Path, parts: "PriorParts", source: CohortSource, options: CohortOptions) -> "PriorParts":
+    from training.prior_choice import MODELS, chosen_parts
+
+    found = open_cohort(source, options)
+    if not found.validation:
+        raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
+    with progress(MODELS, f"choosing the prior on {found.name}") as bar:
+        choice = chosen_parts(run, parts, found.validation, watch=lambda: bar.advance(bar.task_ids[0]))
+    typer.echo(
+        f"{100.0 * choice.parts.least_of_training:g} % of the training's prior stays at least: "
+        f"{100.0 * choice.error:.2f} % of voxels near the surface wrong, {100.0 * choice.trained_error:.2f} % before",
+        err=True,
+    )
+    return choice.parts
 
 
 def anatomy_code(words: str | None) -> dict[str, str]:

@@ -45,8 +45,31 @@ class Codes:
         return self.mean + (apart if self.axes is None else apart @ self.axes)
 
 
-def fitted_prior(prior: LatentPrior, codes: Codes, seed: int = 0) -> tuple[LatentPrior, float]:
-    """A prior of the same shape and sigmas whose flow is fitted to the codes.
+@dataclass(frozen=True)
+class Background:
+    """A Gaussian about the centre of the codes that stands for shapes that are not among them.
+
+    Attributes:
+        share: of the population, from 0 to 1.
+        factor: (e, d) a draw is a standard normal row times it.
+    """
+
+    share: float
+    factor: Float[Tensor, "e d"]
+
+    def mixed_with(self, draws: Float[Tensor, "m d"], generator: torch.Generator) -> Float[Tensor, "m d"]:
+        """Draws of codes, about this share of them replaced by draws of the background."""
+        own = torch.randn(len(draws), len(self.factor), generator=generator) @ self.factor
+        return torch.where(torch.rand(len(draws), 1, generator=generator) < self.share, own, draws)
+
+
+def fitted_prior(
+    prior: LatentPrior, codes: Codes, background: Background | None = None, seed: int = 0
+) -> tuple[LatentPrior, float]:
+    """A prior of the same shape and sigmas whose flow is fitted to the codes and the background.
+
+    The background is what keeps a flow from narrowing a base again that was widened for shapes that are not among the
+    codes (`training.shrinkage`).
 
     Returns:
         The prior, and what its flow adds to the mean log density of the held-out codes (nats, never negative).
@@ -59,17 +82,22 @@ def fitted_prior(prior: LatentPrior, codes: Codes, seed: int = 0) -> tuple[Laten
     held = codes.group % HELD_EVERY == 0
     if not prior.shape.use_flow or held.all() or not held.any():
         return fitted.eval(), 0.0
-    return _descend(fitted, codes.of(~held), codes.of(held), torch.Generator().manual_seed(seed))
+    background = background or Background(0.0, codes.mean[:1])
+    return _descend(fitted, codes.of(~held), codes.of(held), background, torch.Generator().manual_seed(seed))
 
 
-def _descend(prior: LatentPrior, seen: Codes, unseen: Codes, generator: torch.Generator) -> tuple[LatentPrior, float]:
+def _descend(
+    prior: LatentPrior, seen: Codes, unseen: Codes, background: Background, generator: torch.Generator
+) -> tuple[LatentPrior, float]:
     judged = torch.cat([unseen.draw(generator) for _ in range(-(-JUDGED // len(unseen.mean)))])
+    judged = background.mixed_with(judged, generator)
     start = _score(prior, judged)
     best, best_flow, waited = start, copy.deepcopy(prior.flow.state_dict()), 0
     optimiser = torch.optim.AdamW(prior.flow.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     for step in range(1, STEPS + 1):
         chosen = torch.randperm(len(seen.mean), generator=generator)[:BATCH]
-        loss = -prior.log_density(seen.of(chosen).draw(generator)).mean()
+        draws = background.mixed_with(seen.of(chosen).draw(generator), generator)
+        loss = -prior.log_density(draws).mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()

@@ -30,7 +30,7 @@ from model.networks.splines import parameter_count
 from training.autodecoder import AutoDecoder
 from training.choices import LEAST_MOVEMENT, LEAST_OF_TRAINING
 from training.principal import principal_axes, turned_decoder
-from training.prior_fit import Codes, fitted_prior
+from training.prior_fit import Background, Codes, fitted_prior
 from training.shrinkage import shrunk_covariance
 
 #: A dimension whose divergence is below this (nats a training shape) is dead.
@@ -151,7 +151,10 @@ def refitted(
         moving = torch.arange(int((axes.sigma >= least * axes.sigma[0]).sum()))
         decoder = pruned_decoder(turned_decoder(less.decoder, axes), moving, torch.zeros(len(axes.sigma)))
         turned = Codes(axes.of(codes.mean)[:, moving], codes.deviation, codes.group, axes.axes[:, moving])
-    prior, gain = fitted_prior(gaussian_prior(module, axes.sigma[moving], flow=parts.flow), turned)
+        background = Background(
+            share, (torch.linalg.cholesky(target.double()).T @ axes.axes.double()[:, moving]).float()
+        )
+    prior, gain = fitted_prior(gaussian_prior(module, axes.sigma[moving], flow=parts.flow), turned, background)
     return replace(
         less, decoder=decoder.eval(), prior=prior, codes=turned.mean, flow_gain=gain, fitted=parts, shrinkage=share
     )

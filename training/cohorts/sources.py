@@ -50,6 +50,11 @@ class CohortSource:
     space: SpaceName = SpaceName.RAS
     align: bool = False
 
+    @property
+    def is_given(self) -> bool:
+        """Whether any was asked for."""
+        return any(one is not None for one in (self.cohort, self.masks, self.meshes))
+
 
 def open_cohort(source: CohortSource, options: CohortOptions) -> Cohort:
     """Read, inspect, split and, when asked to, align.

@@ -25,6 +25,7 @@ from training.cohorts.cohort import Cohort
 from training.config import Regime, TrainingConfig
 from training.evaluate import Method, fills_of, measure
 from training.generation import SAMPLES, generated
+from training.prior_choice import chosen_parts
 from training.pruning import PriorParts
 from training.release import active_dimensions, export_run
 from training.runs import CHECKPOINT, Run, is_finished, prepare
@@ -99,7 +100,7 @@ def run_cell(
         config = config_of(cell, cohort, effort, device, known=known)
         if not is_finished(place.run, cohort, config):
             prepared(cohort, config, place.run).go(lambda step, _: watch("training", step, config.steps))
-        _export(place, cohort, effort, parts_of(cell))
+        _export(place, cohort, effort, _parts(cell, place, cohort))
     model = open_bundle(place.bundle, threads=1)
     return result_of(cell, model, cohort, effort, time.perf_counter() - begin, watch)
 
@@ -115,6 +116,14 @@ def prepared(cohort: Cohort, config: TrainingConfig, run: Path) -> Run:
 def parts_of(cell: Cell) -> PriorParts | None:
     """What is fitted to the codes of a cell's training: nothing where the cell is plain."""
     return None if cell.prior is PriorName.PLAIN else PriorParts(flow=cell.prior.flow, ard=cell.prior.ard)
+
+
+def _parts(cell: Cell, place: Place, cohort: Cohort) -> PriorParts | None:
+    """What is fitted, with as much of the training's prior as validation shapes want."""
+    parts = parts_of(cell)
+    if parts is None or cell.together or not cohort.validation:
+        return parts
+    return chosen_parts(place.run, parts, cohort.validation, cell.measured_in).parts
 
 
 def config_of(cell: Cell, cohort: Cohort, effort: Effort, device: DeviceName, *, known: bool) -> TrainingConfig:

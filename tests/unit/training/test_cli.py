@@ -197,6 +197,21 @@ class TestExport:
         assert result.exit_code == 2
         assert "67453005 Talus" in result.stderr
 
+    def test_with_a_cohort_the_prior_is_chosen_on_its_validation_shapes(self, run, bundle, tmp_path):
+        words = ("export", bundle.parent / "run", "--output", tmp_path / "out", "--masks", bundle.parent / "masks")
+        result = run(*words)
+        assert result.exit_code == 0, result.stderr
+        assert "of voxels near the surface wrong" in result.stderr
+        fitted = open_bundle(tmp_path / "out").manifest.training["pruned"]["fitted"]
+        assert fitted["least_of_training"] in (0.5, 1.0)
+
+    def test_a_cohort_without_validation_shapes_chooses_nothing(self, run, bundle, tmp_path):
+        write(tmp_path / "masks", "only", ellipsoid(0))
+        words = ("export", bundle.parent / "run", "--output", tmp_path / "out", "--masks", tmp_path / "masks")
+        result = run(*words)
+        assert result.exit_code == 2
+        assert "no validation cases" in result.stderr
+
     def test_a_folder_without_a_run_is_refused(self, run, tmp_path):
         assert run("export", tmp_path, "--output", tmp_path / "out").exit_code == 2
 

@@ -4,7 +4,7 @@ import torch
 
 from model.networks.flow import FlowShape
 from model.networks.prior import LatentPrior, PriorShape
-from training.prior_fit import HELD_EVERY, Codes, fitted_prior
+from training.prior_fit import HELD_EVERY, Background, Codes, fitted_prior
 
 SIGMA = torch.tensor([2.0, 0.1])
 
@@ -37,6 +37,28 @@ def test_what_codes_share_is_learned_and_holds_for_others():
 def test_codes_of_the_gaussian_itself_leave_little_to_learn():
     _, gain = fitted_prior(prior_of(), codes_of(torch.randn(60, 2, generator=torch.Generator().manual_seed(3))))
     assert 0.0 <= gain < 0.2
+
+
+def test_a_base_that_was_widened_on_purpose_stays_wide():
+    """Codes of half the base's width, and a background that makes the whole as wide as the base."""
+    narrow = codes_of(0.5 * torch.randn(200, 2, generator=torch.Generator().manual_seed(3)), deviation=0.0)
+    background = Background(0.5, 1.32 * torch.diag(SIGMA))  # 0.5 (0.25 + 1.75) = 1
+    fitted = {
+        name: fitted_prior(prior_of(), narrow, one)[0] for name, one in (("alone", None), ("widened", background))
+    }
+    base = SIGMA * torch.randn(2000, 2, generator=torch.Generator().manual_seed(5))
+    with torch.no_grad():
+        spread = {name: prior.from_base(base).std(dim=0) / SIGMA for name, prior in fitted.items()}
+    assert (spread["alone"] < 0.75).all()
+    assert (spread["widened"] > 0.85).all()
+
+
+def test_a_background_takes_its_share_of_the_draws():
+    random = torch.Generator().manual_seed(0)
+    draws = Background(0.3, torch.diag(SIGMA)).mixed_with(torch.full((4000, 2), 50.0), random)
+    mixed = draws[:, 0] < 25.0
+    assert abs(mixed.float().mean() - 0.3) < 0.03
+    torch.testing.assert_close(draws[mixed].std(dim=0), SIGMA, rtol=0.1, atol=0.0)
 
 
 def test_sigmas_stay_and_the_inverse_undoes_the_flow():
