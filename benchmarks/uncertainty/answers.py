@@ -17,7 +17,7 @@ from model.inference.uncertainty import ShapeState, occupancy, surface_spread
 from training.calibration import near_surface
 from training.cohorts.cohort import Case
 from training.sparsify import Drawing, Regime, for_evaluation
-from training.surface_error import distances_to, true_points
+from training.surface_error import anti_aliased_points, distances_to, true_points
 
 #: Levels of the intervals that are checked.
 LEVELS = (0.5, 0.9)
@@ -34,10 +34,11 @@ def measure_answer(model: ShapeModel, case: Case, regime: Regime) -> Payload:
     answer = laplace[0]
     points = true_points(case.mask, case.grid)
     errors = distances_to(points, answer.mesh.vertices)
+    smooth = distances_to(anti_aliased_points(case.mask, case.grid), answer.mesh.vertices)
     return {
         "volume": _volume(model, answer, case),
         "voxels": {"laplace": _voxels(model, answer, case), "ensemble": _voxels(model, ensemble[0], case)},
-        "vertices": _vertices(model, answer.mesh, answer.state, ensemble[0].state, errors),
+        "vertices": _vertices(model, answer.mesh, answer.state, ensemble[0].state, errors, smooth),
         "seconds": {
             "fit": laplace[1]["fit"],
             "laplace": laplace[1]["uncertainty"] - plain[1]["uncertainty"],
@@ -84,11 +85,16 @@ def reliability(probability: Float[np.ndarray, "n"], truth: Bool[np.ndarray, "n"
 
 
 def _vertices(
-    model: ShapeModel, mesh: Mesh, laplace: ShapeState, ensemble: ShapeState, errors: Float[np.ndarray, "v"]
+    model: ShapeModel,
+    mesh: Mesh,
+    laplace: ShapeState,
+    ensemble: ShapeState,
+    errors: Float[np.ndarray, "v"],
+    smooth: Float[np.ndarray, "v"],
 ) -> Payload:
     step = max(1, len(errors) // KEPT_VERTICES)
     few = replace(mesh, vertices=mesh.vertices[::step], normals=mesh.normals[::step], faces=mesh.faces[:0], scalars={})
-    found = {"error_mm": errors[::step].round(4).tolist()}
+    found = {"error_mm": errors[::step].round(4).tolist(), "smooth_error_mm": smooth[::step].round(4).tolist()}
     for name, state in (("laplace", laplace), ("ensemble", ensemble)):
         spread = surface_spread(model, state, few)
         found[name] = [] if spread is None else spread.sd().round(4).tolist()

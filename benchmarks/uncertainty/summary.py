@@ -14,6 +14,8 @@ from benchmarks.uncertainty.next_planes import FIRST
 #: A vertex is off when it is farther than this from the true surface (mm).
 OFF_MM = 2.0
 METHODS = ("laplace", "ensemble")
+#: Distance from the truth's anti-aliased surface.
+SMOOTH = "smooth_error_mm"
 #: Draws that tell which correlation SDs would have with errors drawn from themselves.
 IDEAL_DRAWS = 20
 
@@ -73,6 +75,9 @@ def _answer_lines(scope: str, answers: Sequence[Payload]) -> list[Line]:
         Line(scope, "the same of the ensemble", calibration_error(answers, "ensemble")),
         Line(scope, "Spearman of vertex SD and error", spearman["laplace"], 0.5),
         Line(scope, "the same of SDs with errors drawn from them", ideal_spearman(answers)),
+        Line(
+            scope, "the same beside the truth without the stairs of its voxels", spearman_of(answers, "laplace", SMOOTH)
+        ),
         Line(scope, "Spearman less the ensemble's", spearman["laplace"] - spearman["ensemble"], 0.0),
         Line(scope, "ROC area for vertices off by over 2 mm", area["laplace"], 0.85),
         Line(scope, "ROC area less the ensemble's", area["laplace"] - area["ensemble"], 0.0),
@@ -93,16 +98,17 @@ def calibration_error(answers: Iterable[Payload], method: str) -> float:
     return float(np.abs(expected - found).sum() / count.sum())
 
 
-def vertices_of(answers: Iterable[Payload], method: str) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
+def vertices_of(
+    answers: Iterable[Payload], method: str, error: str = "error_mm"
+) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
     """SDs and errors (mm) of the vertices of all answers."""
-    kept = [(p["vertices"][method], p["vertices"]["error_mm"]) for p in answers]
+    kept = [(p["vertices"][method], p["vertices"][error]) for p in answers]
     return np.concatenate([sd for sd, _ in kept]), np.concatenate([error for _, error in kept])
 
 
-def spearman_of(answers: Iterable[Payload], method: str) -> float:
+def spearman_of(answers: Iterable[Payload], method: str, error: str = "error_mm") -> float:
     """Rank correlation of SD and error over the vertices of all answers."""
-    sd, error = vertices_of(answers, method)
-    return float(spearmanr(sd, error).statistic)
+    return float(spearmanr(*vertices_of(answers, method, error)).statistic)
 
 
 def ideal_spearman(answers: Iterable[Payload]) -> float:
