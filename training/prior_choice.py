@@ -6,19 +6,17 @@ is most fitted to the codes is taken of those with which validation shapes are r
 model as it was trained.
 """
 
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from model.bundle import open_bundle
 from training.calibration import wrong_share
 from training.cohorts.cohort import Case
 from training.config import Regime
 from training.pruning import PriorParts
-from training.release import export_run
+from training.release import trial_model
 
 #: Drawings of validation shapes that are reconstructed.
 REGIMES: tuple[Regime, ...] = ("thin", "orthogonal")
@@ -94,7 +92,5 @@ def _by_fitness(parts: PriorParts) -> Iterator[PriorParts]:
 
 
 def _error(run: Path, parts: PriorParts | None, cases: Sequence[Case], regimes: Sequence[Regime]) -> float:
-    with tempfile.TemporaryDirectory() as folder:
-        export_run(run, Path(folder), parts=parts)
-        model = open_bundle(Path(folder), threads=1)
-        return float(np.mean([wrong_share(model, case, regime) for case in cases for regime in regimes]))
+    model = trial_model(run, parts)
+    return float(np.mean([wrong_share(model, case, regime) for case in cases for regime in regimes]))

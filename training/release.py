@@ -5,6 +5,7 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from model.bundle import POPULATION, Manifest, write_manifest
+from model.bundle import POPULATION, Manifest, Population, ShapeModel, write_manifest
 from model.errors import InvalidParameter
-from model.networks.export import export_graphs
+from model.networks.decoder import OccupancyDecoder
+from model.networks.export import export_graphs, torch_networks
 from model.networks.prior import LatentPrior
 from training.autodecoder import AutoDecoder, is_ended
 from training.config import TrainingConfig
-from training.pruning import PriorParts, refitted
+from training.pruning import PriorParts, Pruned, refitted
 from training.runs import CHECKPOINT, read_record
 
 #: Shares of the base variance for which active dimensions are counted (MorphoFlow paper).
@@ -49,40 +51,101 @@ def export_run(
         InvalidParameter: the folder holds no finished run, or the output holds something already.
         ParityError: the exported graphs disagree with the networks.
     """
-    config, record = read_record(run)
-    module = load_module(run, config, record["codes"])
     if output.exists() and any(output.iterdir()):
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
+    found = assembled(run, parts)
     output.mkdir(parents=True, exist_ok=True)
-    less = None if parts is None else refitted(module, len(record["train"]), record["half_extent_mm"], parts)
-    decoder, prior = (module.decoder, module.prior) if less is None else (less.decoder, less.prior)
     with _quiet_exporter():
-        files = export_graphs(decoder, prior, output)
-    write_population(prior, module.code_means() if less is None else less.codes, record, output / POPULATION)
-    sigmas = prior.sigma.detach().cpu().numpy().astype(float)
-    manifest = Manifest(
-        name=name or record["cohort"],
+        files = export_graphs(found.decoder, found.prior, output)
+    np.savez(output / POPULATION, **asdict(found.population()))
+    manifest = replace(
+        found.manifest(),
+        name=name or found.record["cohort"],
         version=version,
-        structure=record["cohort"],
-        frame="RAS",
-        units="mm",
-        side=record["side"],
-        latent_size=len(sigmas),
-        sigmas=tuple(sigmas.tolist()),
-        active_dimensions=active_dimensions(sigmas),
-        half_extent_mm=(record["half_extent_mm"][0], record["half_extent_mm"][1], record["half_extent_mm"][2]),
         resolution_mm=resolution_mm,
         likelihood_precision=likelihood_precision,
-        calibration={},
-        training={**training_facts(config, record), **({} if less is None else {"pruned": less.facts()})},
-        licence=record["licence"],
-        attribution=record["attribution"],
         accuracy={regime: dict(figures) for regime, figures in (accuracy or {}).items()},
         anatomy=dict(anatomy or {}),
         files={file: _digest(output / file) for file in sorted([*files, POPULATION])},
     )
     write_manifest(manifest, output)
     return manifest
+
+
+def trial_model(run: Path, parts: PriorParts | None) -> ShapeModel:
+    """The same model on torch, uncalibrated and without files, for a look at what it can do.
+
+    Raises:
+        InvalidParameter: the folder holds no finished run.
+    """
+    found = assembled(run, parts)
+    decoder, prior = torch_networks(found.decoder, found.prior)
+    return ShapeModel(found.manifest(), "", found.population(), decoder, prior)
+
+
+@dataclass(frozen=True)
+class Assembled:
+    """Networks of a finished run, as they were trained or with a prior fitted to the codes, and what is known of them.
+
+    Attributes:
+        less: what was fitted and left out; None where nothing was.
+        codes: of the training shapes, in the networks' coordinates.
+    """
+
+    config: TrainingConfig
+    record: Mapping[str, Any]
+    decoder: OccupancyDecoder
+    prior: LatentPrior
+    codes: Float[torch.Tensor, "m d"]
+    less: Pruned | None
+
+    def manifest(self) -> Manifest:
+        """Its manifest, uncalibrated and without files."""
+        record, half = self.record, self.record["half_extent_mm"]
+        sigmas = self.prior.sigma.detach().cpu().numpy().astype(float)
+        pruned = {} if self.less is None else {"pruned": self.less.facts()}
+        return Manifest(
+            name=record["cohort"],
+            version="1",
+            structure=record["cohort"],
+            frame="RAS",
+            units="mm",
+            side=record["side"],
+            latent_size=len(sigmas),
+            sigmas=tuple(sigmas.tolist()),
+            active_dimensions=active_dimensions(sigmas),
+            half_extent_mm=(half[0], half[1], half[2]),
+            resolution_mm=RESOLUTION_MM,
+            likelihood_precision=UNCALIBRATED_PRECISION,
+            calibration={},
+            training={**training_facts(self.config, record), **pruned},
+            licence=record["licence"],
+            attribution=record["attribution"],
+            accuracy={},
+            files={},
+        )
+
+    def population(self) -> Population:
+        """Codes, base codes, log densities (nats) and volumes (mL) of the training shapes."""
+        with torch.no_grad():
+            base, _ = self.prior.to_base(self.codes)
+            density = self.prior.log_density(self.codes)
+        volumes = np.array(self.record["volumes_ml"], float)
+        return Population(_array(self.codes), _array(base), _array(density), volumes)
+
+
+def assembled(run: Path, parts: PriorParts | None) -> Assembled:
+    """The networks of a finished run, with these parts of a prior fitted to its codes, or as they were trained.
+
+    Raises:
+        InvalidParameter: the folder holds no finished run.
+    """
+    config, record = read_record(run)
+    module = load_module(run, config, record["codes"])
+    if parts is None:
+        return Assembled(config, record, module.decoder, module.prior, module.code_means(), None)
+    less = refitted(module, len(record["train"]), record["half_extent_mm"], parts)
+    return Assembled(config, record, less.decoder, less.prior, less.codes, less)
 
 
 @contextmanager
@@ -127,22 +190,6 @@ def wants_prior(run: Path) -> bool:
     """
     config, _ = read_record(run)
     return config.objective.name != "paper" and not (config.prior.use_flow or config.prior.use_ard)
-
-
-def write_population(
-    prior: LatentPrior, codes: Float[torch.Tensor, "m d"], record: Mapping[str, Any], path: Path
-) -> None:
-    """Codes, base codes, log densities (nats) and volumes (mL) of the training shapes."""
-    with torch.no_grad():
-        base, _ = prior.to_base(codes)
-        density = prior.log_density(codes)
-    np.savez(
-        path,
-        codes=_array(codes),
-        base_codes=_array(base),
-        log_densities=_array(density),
-        volumes_ml=np.array(record["volumes_ml"], float),
-    )
 
 
 def _array(values: torch.Tensor) -> Float[np.ndarray, "..."]:

@@ -27,6 +27,7 @@ from model.errors import ParityError
 from model.networks.decoder import OccupancyDecoder
 from model.networks.flow import SplineTransform
 from model.networks.prior import LatentPrior
+from model.networks.torchscript import TorchDecoder, TorchPrior
 
 #: Largest difference between torch, TorchScript and ONNX Runtime, relative to the size of the output (and 1).
 PARITY_TOLERANCE = 1e-4
@@ -151,6 +152,18 @@ def graph_specs(decoder: OccupancyDecoder, prior: LatentPrior) -> list[GraphSpec
         GraphSpec("prior_base_jacobian", BaseJacobianGraph(prior), ("latent",), ("base", "jacobian"), None, units),
         *(GraphSpec(f"prior_sampling_{k}", s, ("target", "guess"), ("next",), s, units) for k, s in enumerate(steps)),
     ]
+
+
+def torch_networks(decoder: OccupancyDecoder, prior: LatentPrior) -> tuple[TorchDecoder, TorchPrior]:
+    """The same graphs as they are, unexported, for inference here and now."""
+    decoder, prior = decoder.eval().requires_grad_(False).cpu(), prior.eval().requires_grad_(False).cpu()
+    graphs = {spec.name: spec.scripted for spec in graph_specs(decoder, prior) if spec.scripted is not None}
+    size = decoder.shape.latent_size
+    steps = [graph for name, graph in graphs.items() if name.startswith("prior_sampling_")]
+    return (
+        TorchDecoder(size, graphs["decoder_logits"], graphs["decoder_jacobians"]),
+        TorchPrior(size, graphs["prior_density"], steps),
+    )
 
 
 def export_graphs(decoder: OccupancyDecoder, prior: LatentPrior, folder: Path) -> list[str]:

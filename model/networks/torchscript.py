@@ -1,20 +1,24 @@
-"""Decoder and prior of a bundle on TorchScript: the second implementation behind `model.backends`."""
+"""Decoder and prior on torch: from TorchScript, the second implementation behind `model.backends`, or from modules."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+#: A graph as `model.networks.export` names it.
+Graph = Callable[..., Any]
 
-class ScriptDecoder:
-    """A bundle's decoder; see `model.backends.Decoder`."""
 
-    def __init__(self, folder: Path, latent_size: int) -> None:
+class TorchDecoder:
+    """A decoder by its graphs; see `model.backends.Decoder`."""
+
+    def __init__(self, latent_size: int, logits: Graph, jacobians: Graph) -> None:
         self.latent_size = latent_size
-        self._logits = torch.jit.load(folder / "decoder_logits.pt")
-        self._jacobians = torch.jit.load(folder / "decoder_jacobians.pt")
+        self._logits, self._jacobians = logits, jacobians
 
     def logits(self, latent: Float[np.ndarray, "b d"], points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n"]:
         """See `model.backends.Decoder`."""
@@ -37,14 +41,12 @@ class ScriptDecoder:
         return logits, by_point
 
 
-class ScriptPrior:
-    """A bundle's prior; see `model.backends.Prior`."""
+class TorchPrior:
+    """A prior by its graphs; see `model.backends.Prior`."""
 
-    def __init__(self, folder: Path, latent_size: int) -> None:
+    def __init__(self, latent_size: int, density: Graph, steps: Sequence[Graph]) -> None:
         self.latent_size = latent_size
-        self._density = torch.jit.load(folder / "prior_density.pt")
-        count = len(list(folder.glob("prior_sampling_*.pt")))
-        self._steps = [torch.jit.load(folder / f"prior_sampling_{k}.pt") for k in range(count)]
+        self._density, self._steps = density, steps
 
     def log_density(self, latent: Float[np.ndarray, "b d"]) -> tuple[Float[np.ndarray, "b"], Float[np.ndarray, "b d"]]:
         """See `model.backends.Prior`."""
@@ -79,11 +81,16 @@ class ScriptPrior:
         return _array(value)
 
 
-def load(folder: Path, latent_size: int, threads: int | None) -> tuple[ScriptDecoder, ScriptPrior]:
+def load(folder: Path, latent_size: int, threads: int | None) -> tuple[TorchDecoder, TorchPrior]:
     """Decoder and prior of a bundle."""
     if threads:
         torch.set_num_threads(threads)
-    return ScriptDecoder(folder, latent_size), ScriptPrior(folder, latent_size)
+    logits, jacobians, density = (
+        torch.jit.load(folder / f"{name}.pt") for name in ("decoder_logits", "decoder_jacobians", "prior_density")
+    )
+    count = len(list(folder.glob("prior_sampling_*.pt")))
+    steps = [torch.jit.load(folder / f"prior_sampling_{k}.pt") for k in range(count)]
+    return TorchDecoder(latent_size, logits, jacobians), TorchPrior(latent_size, density, steps)
 
 
 def _tensor(values: Float[np.ndarray, "..."]) -> Tensor:
