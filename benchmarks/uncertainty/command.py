@@ -15,10 +15,12 @@ from typing import Annotated
 import typer
 
 from benchmarks.accuracy.command import bundles_of
+from benchmarks.accuracy.drawings import DrawingName
 from benchmarks.accuracy.plan import chosen_cases
 from benchmarks.uncertainty.answers import measure_answer
 from benchmarks.uncertainty.cells import Key, Payload, Store
 from benchmarks.uncertainty.diagrams import save_diagrams
+from benchmarks.uncertainty.maps import save_maps
 from benchmarks.uncertainty.next_planes import RUNS, measure_next_planes
 from benchmarks.uncertainty.strangers import Trial, measure_trial, trials
 from benchmarks.uncertainty.summary import Line, lines_of
@@ -56,15 +58,18 @@ def main(
     data: Annotated[Path | None, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = None,
     output: Annotated[Path, typer.Option(help="Folder of cells, table and diagrams.")] = OUTPUT,
     jobs: Annotated[int, typer.Option(min=1, help="Processes at a time.")] = 1,
+    mapped: Annotated[int, typer.Option(min=0, help="Cases whose SDs are drawn beside the errors.")] = 0,
 ) -> None:
     """Measure intervals, voxels, vertices, time, advice and typicality."""
     with exit_status():
         bundles = bundles_of(model or [])
         chosen = cohort or [name for name in CohortName if name in bundles]
         tasks: list[Task] = []
+        shown: dict[str, tuple[Case, ...]] = {}
         for name in chosen:
             found = load_cohort(name, data_folder(data), CohortOptions(skip_refused=True))
             mine = chosen_cases(found.test, cases)
+            shown[name.value] = chosen_cases(mine, mapped) if mapped else ()
             tasks += _tasks(name.value, bundles[name], mine, regimes or MEASURED, plane_cases)
             tasks += _gold_tasks(name.value, bundles[name], mine, regimes or MEASURED, gold_cases)
             if strangers is name:
@@ -78,6 +83,9 @@ def main(
         (output / "table.md").write_text(text + "\n", encoding="utf-8")
         for name in chosen:
             save_diagrams(cells, name.value, output / f"uncertainty-{name.value}.png")
+            for regime in (regimes or MEASURED) if shown[name.value] else ():
+                path = output / f"maps-{name.value}-{regime}.png"
+                save_maps(_opened(bundles[name]), shown[name.value], DrawingName(regime.value), path)
         typer.echo(text)
         for fault in faults:
             typer.echo(f"not measured: {fault}", err=True)
