@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt
 from scipy.special import expit
 
 from model.bundle import ShapeModel
@@ -21,6 +22,7 @@ from model.inference.posterior import (
     fitted_logits,
     logit_variance,
     mean_probability,
+    model_logits,
     normal_displacements,
     open_variance,
 )
@@ -29,6 +31,8 @@ from model.inference.surface import canonical_box
 
 #: Beyond this logit the posterior variance cannot move a probability visibly.
 SATURATED_LOGIT = 12.0
+#: Farther than this from the fit's surface (mm) no member of an ensemble has another label.
+FAR_MM = 8.0
 
 
 @dataclass(frozen=True)
@@ -103,14 +107,12 @@ def occupancy(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndar
     result = np.zeros(grid.shape, np.float32)
     index, points = _voxels_in_box(model, state.fits[0], grid)
     if len(points):
-        result[tuple(index.T)] = _probabilities(model, state, points)
+        found = _shares(model, state, grid, index, points) if state.members else _probabilities(model, state, points)
+        result[tuple(index.T)] = found
     return result
 
 
 def _probabilities(model: ShapeModel, state: ShapeState, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    if state.members:
-        members = [_sigmoid(fitted_logits(model, member, points)) for member in state.members]
-        return np.asarray(np.mean(members, axis=0))
     logits = fitted_logits(model, state.fits[0], points)
     result = _sigmoid(logits)
     open_points = np.abs(logits) < SATURATED_LOGIT
@@ -120,6 +122,31 @@ def _probabilities(model: ShapeModel, state: ShapeState, points: Float[np.ndarra
         variance = logit_variance(by_parameter, state.covariance) + open_variance(found, near)
         result[open_points] = mean_probability(centre, variance)
     return result
+
+
+def _shares(
+    model: ShapeModel, state: ShapeState, grid: Grid, index: Int[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """Mean probability over an ensemble; far from the fit's surface all members agree with it."""
+    inside = model_logits(model, state.fits[0], points) > 0
+    near = _near_border(inside, index, grid.spacing)
+    result = inside.astype(float)
+    members = [_sigmoid(fitted_logits(model, member, points[near])) for member in state.members]
+    result[near] = np.mean(members, axis=0)
+    return result
+
+
+def _near_border(
+    inside: Bool[np.ndarray, "n"], index: Int[np.ndarray, "n 3"], spacing: Float[np.ndarray, "3"]
+) -> Bool[np.ndarray, "n"]:
+    """Voxels within `FAR_MM` of others of another label; all where there is but one label."""
+    if inside.all() or not inside.any():
+        return np.ones(len(inside), bool)
+    places = tuple((index - index.min(axis=0)).T)
+    labels = np.zeros(np.ptp(index, axis=0) + 1, bool)
+    labels[places] = inside
+    distance = np.where(labels, *(distance_transform_edt(one, spacing) for one in (labels, ~labels)))
+    return np.asarray(distance[places] <= FAR_MM)
 
 
 def _voxels_in_box(

@@ -244,6 +244,19 @@ def test_uncertain_occupancy_is_the_posterior_mean(grid):
     np.testing.assert_allclose(values[~near & (beyond < 0)], expit(logits[~near & (beyond < 0)]), atol=1e-6)
 
 
+def test_far_from_the_surface_an_ensemble_is_as_sure_as_its_members():
+    """There the fit's label stands for theirs."""
+    members = tuple(moved(step) for step in parameter_draws(covariance_of(latent=0.2, position=0.5), 4, seed=0))
+    half = canonical_box(MODEL).max()
+    grid = Grid(
+        (24, 24, 24), np.diag([*[2.0 * half / 23] * 3, 1.0]) + np.pad((CENTRE - half)[:, None], ((0, 1), (3, 0)))
+    )
+    values = occupancy(MODEL, ShapeState((FIT, *members), None), grid)
+    single = np.mean([occupancy(MODEL, ShapeState((member,), None), grid) for member in members], axis=0)
+    assert ((values == 0.0) | (values == 1.0)).sum() > 1000
+    np.testing.assert_allclose(values, single, atol=1e-3)
+
+
 def test_ensemble_occupancy_is_the_mean_of_its_members():
     members = tuple(moved(step) for step in parameter_draws(covariance_of(latent=0.3, position=0.5), 6, seed=0))
     grid = cube_around(CENTRE, step=2.0, nodes=15)
