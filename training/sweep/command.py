@@ -88,15 +88,18 @@ def sweep(
 def _run(plan: "Sweep", jobs: int | None, *, as_json: bool) -> None:
     from training.sweep.summary import CSV, write_csv
     from training.sweep.table import read_results
-    from training.sweep.workers import refusals, unfinished, work
+    from training.sweep.workers import refusals, unfinished, work, work_together
 
     plan.folder.mkdir(parents=True, exist_ok=True)
     if resolved(plan.device) == "cuda":
         _train_side_by_side(plan)
-    if "LOCAL_RANK" in os.environ or jobs == 1:
+    # torchrun ends all of its processes when one of them ends with cells unfinished.
+    under_torchrun = "LOCAL_RANK" in os.environ
+    if under_torchrun or jobs == 1:
+        go = work_together if under_torchrun else work
         with progress(1, f"{len(unfinished(plan))} cells") as bar:
             task = bar.task_ids[0]
-            work(plan, lambda words, done, total: bar.update(task, description=words, completed=done, total=total))
+            go(plan, lambda words, done, total: bar.update(task, description=words, completed=done, total=total))
     else:
         _watch_workers(plan, jobs or len(os.sched_getaffinity(0)))
     results = read_results(plan.folder) if (plan.folder / "results.jsonl").is_file() else []

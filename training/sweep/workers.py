@@ -9,6 +9,7 @@ them than the folder.
 import fcntl
 import multiprocessing
 import os
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -25,6 +26,8 @@ from training.sweep.plan import Cell, by_training
 from training.sweep.table import append, done
 
 REFUSED = "refused.txt"
+#: Seconds between two looks at what other processes hold.
+WAIT_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,14 @@ def work(sweep: Sweep, watch: Watch = lambda words, done, total: None) -> None:
             for cell in cells:
                 if mine and cell.key not in done(sweep.folder):
                     _attempt(sweep, cell, cohorts, watch)
+
+
+def work_together(sweep: Sweep, watch: Watch = lambda words, done, total: None) -> None:
+    """The same until every cell has come to a result or a refusal, here or elsewhere; what others leave is taken over."""
+    work(sweep, watch)
+    while left := [cell for cell in unfinished(sweep) if not _refusal(sweep, cell).is_file()]:
+        time.sleep(WAIT_S)
+        work(replace(sweep, cells=tuple(left)), watch)
 
 
 class Cohorts:

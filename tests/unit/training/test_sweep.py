@@ -29,7 +29,7 @@ from training.sweep.record import read_record, write_record
 from training.sweep.streams import Progress, train_side_by_side
 from training.sweep.summary import correlation, row_of, write_csv
 from training.sweep.table import Result, append, done, read_results
-from training.sweep.workers import Sweep, held, refusals, work
+from training.sweep.workers import Sweep, held, refusals, work, work_together
 
 QUICK = [
     "--latent-size",
@@ -268,6 +268,41 @@ def test_a_killed_sweep_goes_on_from_its_checkpoint(masks, tmp_path, repository)
     (one,) = read_results(folder)
     assert one.steps == 1200
     assert len(list(folder.glob("trainings/*/run/figures/*"))) >= events
+
+
+def test_a_process_of_torchrun_waits_for_the_others(masks, tmp_path, repository):
+    """torchrun ends all of its processes with the first that fails, and one with nothing left to do must not."""
+    folder = tmp_path / "out"
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    words = ["sweep", "--masks", str(masks), *QUICK, "--latent-size", "4", "--prior", "plain", "--output", str(folder)]
+    answer = subprocess.run(
+        [*torchrun, "-m", "service.cli", *words], env={**os.environ, "PYTHONPATH": str(repository)},
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert answer.returncode == 0, answer.stderr[-2000:]
+    assert len(read_results(folder)) == 2
+
+
+def test_what_another_process_leaves_unfinished_is_taken_over(masks, tmp_path):
+    cells = tuple(cells_of([3], ["thin"], [PriorName.PLAIN], [0], "variational"))
+    effort = Effort(steps=8, calibrate=False, samples=0)
+    plan = Sweep(CohortSource(masks=masks), CohortOptions(), cells, tmp_path, effort, DeviceName.CPU)
+    other = multiprocessing.get_context("spawn").Process(
+        target=hold_for, args=(tmp_path / "trainings" / cells[0].training_key, 4.0)
+    )
+    other.start()
+    while not list(tmp_path.glob("trainings/*/lock")):
+        time.sleep(0.02)
+    work(plan)
+    assert not (tmp_path / "results.jsonl").exists()
+    work_together(plan)
+    assert len(read_results(tmp_path)) == 1
+    other.join()
+
+
+def hold_for(folder, seconds):
+    with held(folder):
+        time.sleep(seconds)
 
 
 class TestSideBySide:
