@@ -83,7 +83,7 @@ def work(sweep: Sweep, watch: Watch = lambda words, done, total: None) -> None:
 
 
 def work_together(sweep: Sweep, watch: Watch = lambda words, done, total: None) -> None:
-    """The same until every cell has come to a result or a refusal, here or elsewhere; what others leave is taken over."""
+    """The same until every cell has a result or a refusal, made here or elsewhere; what others leave is taken over."""
     work(sweep, watch)
     while left := [cell for cell in unfinished(sweep) if not _refusal(sweep, cell).is_file()]:
         time.sleep(WAIT_S)
