@@ -49,7 +49,7 @@ def _predicted(
     objective: Objective, found: Fit, shares: Sequence[Float[np.ndarray, "k"]]
 ) -> Iterator[Float[np.ndarray, "p"]]:
     """Newton's step from the fit to the optimum under each weighting of the planes."""
-    here = _moved(found, np.zeros(len(found.precision)))
+    here = Place(found.latent, found.pose)
     terms = objective.by_plane(here)
     for share in shares:
         point = objective.gathered(here, [term.times(part) for term, part in zip(terms, share, strict=True)])

@@ -1,8 +1,8 @@
 """How far an ensemble's surfaces lie from the fit's, along its normals.
 
 To first order a member moves the surface as its step of code and pose does. What that misses varies slowly over the
-surface, so each member's own field is evaluated at some of the vertices and the difference is carried to the others: a
-control variate, a fifth of the network's work for SDs that correlate with those of all vertices by 0.98.
+surface, so each member's own field is evaluated at some of the vertices and the difference is carried to the others, as
+a control variate: a fifth of the network's work (docs/method.md has what it costs in accuracy).
 """
 
 from collections.abc import Sequence

@@ -107,7 +107,11 @@ def occupancy(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndar
     result = np.zeros(grid.shape, np.float32)
     index, points = _voxels_in_box(model, state.fits[0], grid)
     if len(points):
-        found = _shares(model, state, grid, index, points) if state.members else _probabilities(model, state, points)
+        found = (
+            _member_probabilities(model, state, grid, index, points)
+            if state.members
+            else _probabilities(model, state, points)
+        )
         result[tuple(index.T)] = found
     return result
 
@@ -124,7 +128,7 @@ def _probabilities(model: ShapeModel, state: ShapeState, points: Float[np.ndarra
     return result
 
 
-def _shares(
+def _member_probabilities(
     model: ShapeModel, state: ShapeState, grid: Grid, index: Int[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
     """Mean probability over an ensemble; far from the fit's surface all members agree with it."""
