@@ -153,9 +153,16 @@ def export(
         from training.pruning import PriorParts
         from training.release import export_run, wants_prior
 
-        fitted = wants_prior(run) if prune is None else prune
+        stood_still = wants_prior(run)
+        fitted = stood_still if prune is None else prune
         parts = PriorParts(least_movement=least_movement, least_of_training=training_share)
-        if fitted and wants_prior(run) and source.is_given:
+        if source.is_given:
+            if not (fitted and stood_still):
+                raise InvalidParameter(
+                    "A cohort chooses how much of the training's prior stays; it is accepted where a prior is fitted "
+                    "to the codes of a run without a flow or ARD of its own.",
+                    part="cohort",
+                )
             parts = _parts_for(run, parts, source, options)
         manifest = export_run(
             run,

@@ -12,11 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
+from model.errors import InvalidParameter
 from training.calibration import wrong_share
 from training.cohorts.cohort import Case
 from training.config import Regime
 from training.pruning import PriorParts
 from training.release import trial_model
+from training.runs import mask_digest, read_record
 
 #: Drawings of validation shapes that are reconstructed.
 REGIMES: tuple[Regime, ...] = ("thin", "orthogonal")
@@ -61,8 +63,9 @@ def chosen_parts(
         watch: called after each model that was measured.
 
     Raises:
-        InvalidParameter: the run is not finished.
+        InvalidParameter: the run is not finished, or was trained on one of the cases.
     """
+    _check_unseen(run, cases)
     used = cases[:: -(-len(cases) // CASES)]
 
     def error(candidate: PriorParts | None) -> float:
@@ -71,6 +74,17 @@ def chosen_parts(
         return found
 
     return choice_by(error, parts)
+
+
+def _check_unseen(run: Path, cases: Sequence[Case]) -> None:
+    seen = set(read_record(run)[1]["train"].values())
+    names = [case.name for case in cases if mask_digest(case) in seen]
+    if names:
+        raise InvalidParameter(
+            f"The run was trained on {names[0]}, which is to be a validation case; the cohort, and the seed, of the "
+            "training are accepted.",
+            part="cohort",
+        )
 
 
 def choice_by(error: Callable[[PriorParts | None], float], parts: PriorParts) -> Choice:

@@ -10,6 +10,8 @@ from typer.testing import CliRunner
 from model.bundle import open_bundle
 from training.choices import DeviceName, ObjectiveName, RegimeName, configured, with_batches, with_duration
 from training.cli import register
+from training.cohorts import CohortOptions
+from training.cohorts.sources import CohortSource, open_cohort
 from training.config import TrainingConfig
 
 SMALL = ["--steps", "6", "--latent-size", "3", "--device", "cpu"]
@@ -172,6 +174,10 @@ class TestConfiguration:
         assert config.steps == steps
 
 
+def held_out(masks, options):
+    return [case.name for case in open_cohort(CohortSource(masks=masks), options).validation]
+
+
 @pytest.mark.slow
 class TestExport:
     def test_the_bundle_opens_and_says_what_it_was_made_of(self, bundle):
@@ -204,6 +210,22 @@ class TestExport:
         assert "of voxels near the surface wrong" in result.stderr
         fitted = open_bundle(tmp_path / "out").manifest.training["pruned"]["fitted"]
         assert fitted["least_of_training"] in (0.5, 1.0)
+
+    def test_the_prior_is_not_chosen_on_shapes_of_the_training(self, run, bundle, tmp_path):
+        """Another seed holds out another shape, which this run was trained on."""
+        words = ("export", bundle.parent / "run", "--output", tmp_path / "out", "--masks", bundle.parent / "masks")
+        held = json.loads((bundle.parent / "run" / "run.json").read_text(encoding="utf-8"))["validation"]
+        options = (CohortOptions(seed=seed) for seed in range(1, 9))
+        others = (one for one in options if held_out(bundle.parent / "masks", one) != held)
+        result = run(*words, "--seed", next(others).seed)
+        assert result.exit_code == 2
+        assert "was trained on" in result.stderr
+
+    def test_a_cohort_where_nothing_is_chosen_is_refused(self, run, bundle, tmp_path):
+        words = ("export", bundle.parent / "run", "--output", tmp_path / "out", "--masks", bundle.parent / "masks")
+        result = run(*words, "--no-prune")
+        assert result.exit_code == 2
+        assert "chooses how much" in result.stderr
 
     def test_a_cohort_without_validation_shapes_chooses_nothing(self, run, bundle, tmp_path):
         write(tmp_path / "masks", "only", ellipsoid(0))
