@@ -87,23 +87,20 @@ def fitted_prior(
     held = codes.group % HELD_EVERY == 0
     if not prior.shape.use_flow or held.all() or not held.any():
         return fitted.eval(), 0.0
-    background = background or Background(0.0, codes.mean[:1])
     return _descend(fitted, codes.of(~held), codes.of(held), background, torch.Generator().manual_seed(seed))
 
 
 def _descend(
-    prior: LatentPrior, seen: Codes, unseen: Codes, background: Background, generator: torch.Generator
+    prior: LatentPrior, seen: Codes, unseen: Codes, background: Background | None, generator: torch.Generator
 ) -> tuple[LatentPrior, float]:
-    judged = torch.cat([unseen.draw(generator) for _ in range(-(-JUDGED // len(unseen.mean)))])
-    judged = background.mixed_with(judged, generator)
+    judged = torch.cat([_draws(unseen, background, generator) for _ in range(-(-JUDGED // len(unseen.mean)))])
     start = _score(prior, judged)
     flat = copy.deepcopy(prior.flow.state_dict())
     best, best_flow, waited = start, flat, 0
     optimiser = torch.optim.AdamW(prior.flow.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     for step in range(1, STEPS + 1):
         chosen = torch.randperm(len(seen.mean), generator=generator)[:BATCH]
-        draws = background.mixed_with(seen.of(chosen).draw(generator), generator)
-        loss = -prior.log_density(draws).mean()
+        loss = -prior.log_density(_draws(seen.of(chosen), background, generator)).mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
@@ -117,6 +114,11 @@ def _descend(
         best, best_flow = start, flat
     prior.flow.load_state_dict(best_flow)
     return prior.eval(), best - start
+
+
+def _draws(codes: Codes, background: Background | None, generator: torch.Generator) -> Float[Tensor, "m d"]:
+    draws = codes.draw(generator)
+    return draws if background is None else background.mixed_with(draws, generator)
 
 
 @torch.no_grad()

@@ -5,29 +5,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, observed_anew, with_discrepancy
+from model.inference.discrepancy.conditioning import observed_anew
 from model.inference.ensemble import fit_ensemble
-from model.inference.fitting import FitOptions, fit
-from model.inference.mask_stack import Plane
 from model.inference.member_moves import member_moves
 from model.inference.posterior import fitted_jacobians, fitted_logits
 from model.inference.surface import surface_of
-from tests.analytic_model import ellipsoid_model
-from tests.analytic_shapes import Ellipsoid
-from tests.drawn_shapes import cube_around, drawn, observed
-
-CENTRE = np.array([30.0, -20.0, 50.0])
-GRID = cube_around(CENTRE)
-MODEL = replace(ellipsoid_model(), manifest=replace(ellipsoid_model().manifest, likelihood_precision=0.1))
-MIDDLE = round(float(GRID.to_index(CENTRE[None])[0, 0]))
-PLANES = (Plane(0, 2, MIDDLE - 3), Plane(0, 2, MIDDLE + 3), Plane(0, 0, MIDDLE))
-STACK = drawn(Ellipsoid((13.0, 9.0, 6.5), CENTRE), GRID, PLANES)
-OBSERVATIONS = observed(STACK, PLANES)
-
-
-def fitted(fidelity):
-    found = fit(MODEL, OBSERVATIONS, FitOptions(robust=False))
-    return with_discrepancy(MODEL, found, [STACK], OBSERVATIONS, DiscrepancyPrior(0.6, fidelity))
+from tests.few_planes import MODEL, OBSERVATIONS, fitted
 
 
 def held(found, latent_step, shift):

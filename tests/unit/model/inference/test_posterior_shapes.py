@@ -5,32 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
 from model.inference.discrepancy.draws import drawn as drawn_process
-from model.inference.fitting import FitOptions, fit
-from model.inference.mask_stack import Plane
 from model.inference.mesh import is_watertight, vertex_areas, volume_ml
 from model.inference.posterior import fitted_logits, laplace_covariance
 from model.inference.posterior_shapes import draw_posterior
 from model.inference.surface import surface_of
 from model.inference.uncertainty import ShapeState, surface_spread
-from tests.analytic_model import ellipsoid_model
-from tests.analytic_shapes import Ellipsoid
-from tests.drawn_shapes import cube_around, drawn, observed
+from tests.few_planes import MODEL, fitted
 
-CENTRE = np.array([30.0, -20.0, 50.0])
-GRID = cube_around(CENTRE)
-MODEL = replace(ellipsoid_model(), manifest=replace(ellipsoid_model().manifest, likelihood_precision=0.1))
-MIDDLE = round(float(GRID.to_index(CENTRE[None])[0, 0]))
-PLANES = (Plane(0, 2, MIDDLE - 3), Plane(0, 2, MIDDLE + 3), Plane(0, 0, MIDDLE))
-STACK = drawn(Ellipsoid((13.0, 9.0, 6.5), CENTRE), GRID, PLANES)
-OBSERVATIONS = observed(STACK, PLANES)
 DRAWS = 60
 
 
 def state(fidelity, spread_mm=0.6):
-    found = fit(MODEL, OBSERVATIONS, FitOptions(robust=False))
-    found = with_discrepancy(MODEL, found, [STACK], OBSERVATIONS, DiscrepancyPrior(spread_mm, fidelity))
+    found = fitted(fidelity, spread_mm)
     return ShapeState((found,), laplace_covariance(found))
 
 
