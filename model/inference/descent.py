@@ -42,7 +42,7 @@ class Descent:
             return None
         step = damped_step(self.point, self.damping)
         self.expected = -float(step @ self.point.gradient + 0.5 * step @ self.point.curvature @ step)
-        place = Place(self.point.latent + step[:-POSE_SIZE], self.point.pose.moved(step[-POSE_SIZE:]))
+        place = Place(self.point.latent, self.point.pose).moved(step)
         if self.expected >= options.tolerance:
             return place
         # Behind rejected steps a step is short by its damping, not because the optimum is near.

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 
 from model.bundle import ShapeModel
-from model.geometry import POSE_SIZE
 from model.inference.descent import descend
 from model.inference.fitting import Fit, FitOptions, fit_of
 from model.inference.objective import LinearPrior, Objective, Place, reweighted
@@ -38,26 +37,22 @@ def fit_ensemble(
     fewer = thinned(observations, EVERY, seed=seed)
     options = FitOptions(robust=False, tolerance=TOLERANCE)
     tangent = LinearPrior.around(model.prior, found.latent).base_jacobian
-    predicted = _predicted(Objective(model, fewer, found.pose, options, tangent), found, shares)
+    here = Place(found.latent, found.pose)
+    predicted = _predicted(Objective(model, fewer, found.pose, options, tangent), here, shares)
     spread = START_SPREAD * np.linalg.cholesky(laplace_covariance(found))
-    starts = [_moved(found, step + spread @ random.standard_normal(len(step))) for step in predicted]
+    starts = [here.moved(step + spread @ random.standard_normal(len(step))) for step in predicted]
     objectives = [Objective(model, reweighted(fewer, share), found.pose, options, tangent) for share in shares]
     return tuple(fit_of(problem) for problem in descend(objectives, starts, 1.0, options))
 
 
 def _predicted(
-    objective: Objective, found: Fit, shares: Sequence[Float[np.ndarray, "k"]]
+    objective: Objective, here: Place, shares: Sequence[Float[np.ndarray, "k"]]
 ) -> Iterator[Float[np.ndarray, "p"]]:
-    """Newton's step from the fit to the optimum under each weighting of the planes."""
-    here = Place(found.latent, found.pose)
+    """Newton's step from a place to the optimum under each weighting of the planes."""
     terms = objective.by_plane(here)
     for share in shares:
         point = objective.gathered(here, [term.times(part) for term, part in zip(terms, share, strict=True)])
         yield -cho_solve(cho_factor(point.curvature), point.gradient)
-
-
-def _moved(found: Fit, step: Float[np.ndarray, "p"]) -> Place:
-    return Place(found.latent + step[:-POSE_SIZE], found.pose.moved(step[-POSE_SIZE:]))
 
 
 def _trust(found: Fit, planes: int) -> Float[np.ndarray, "k"]:

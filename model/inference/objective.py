@@ -21,7 +21,7 @@ from scipy.special import expit
 
 from model.backends import Prior
 from model.bundle import ShapeModel
-from model.geometry import Pose
+from model.geometry import POSE_SIZE, Pose
 from model.inference.fit_types import FitOptions
 from model.inference.observations import Observations
 
@@ -58,6 +58,10 @@ class Place:
 
     latent: Float[np.ndarray, "d"]
     pose: Pose
+
+    def moved(self, step: Float[np.ndarray, "p"]) -> "Place":
+        """The place a step of (latent, pose step) away, see `Pose.moved`."""
+        return Place(self.latent + step[:-POSE_SIZE], self.pose.moved(step[-POSE_SIZE:]))
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from model.inference.discrepancy.conditioning import observed_anew
 from model.inference.discrepancy.draws import drawn
 from model.inference.fitting import Fit
 from model.inference.mesh import Mesh
+from model.inference.objective import Place
 from model.inference.surface import surface_of
 from model.inference.uncertainty import ShapeState, calibrated_scale
 
@@ -56,9 +57,10 @@ def _around(model: ShapeModel, state: ShapeState, seed: int) -> Fit:
     values, vectors = np.linalg.eigh(state.covariance)
     scale, offset = calibrated_scale(model)
     step = scale * vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
-    latent, pose = found.latent + step[:-7], found.pose.moved(step[-7:])
-    held = observed_anew(model, found, latent, pose)
+    place = Place(found.latent, found.pose).moved(step)
+    (held,) = observed_anew(model, found, [place])
+    moved = replace(found, latent=place.latent, pose=place.pose)
     if held is None:
-        return replace(found, latent=latent, pose=pose)
+        return moved
     shift = offset * float(random.standard_normal())
-    return replace(found, latent=latent, pose=pose, discrepancy=drawn(held, int(random.integers(2**32)), scale, shift))
+    return replace(moved, discrepancy=drawn(held, int(random.integers(2**32)), scale, shift))

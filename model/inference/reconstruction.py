@@ -17,7 +17,7 @@ from model.inference.ensemble import fit_ensemble
 from model.inference.estimates import Estimate
 from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
 from model.inference.mesh import Mesh
-from model.inference.objective import reweighted
+from model.inference.objective import Place, reweighted
 from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
 from model.inference.posterior import fitted_logits, laplace_covariance
 from model.inference.reliability import figures_of, less_trusting, reliability_warnings, thickness_warnings
@@ -213,7 +213,8 @@ def _state(model: ShapeModel, observations: Observations, found: Fit, options: O
     """The fit and its posterior; the contours hold the members of an ensemble as they hold the fit."""
     if options.uncertainty == "ensemble":
         members = fit_ensemble(model, observations, found, options.seed)
-        held = (replace(one, discrepancy=observed_anew(model, found, one.latent, one.pose)) for one in members)
+        seen = observed_anew(model, found, [Place(one.latent, one.pose) for one in members])
+        held = (replace(one, discrepancy=anew) for one, anew in zip(members, seen, strict=True))
         return ShapeState((found, *held), None)
     return ShapeState((found,), laplace_covariance(found) if options.uncertainty == "laplace" else None)
 

@@ -8,13 +8,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from model.bundle import Manifest, ShapeModel
-from model.geometry import Pose
 from model.inference.discrepancy.contours import contour_points
 from model.inference.discrepancy.covariance import Covariance
 from model.inference.discrepancy.grouping import cells_of, means_of
 from model.inference.discrepancy.process import REACH_MM, Discrepancy
 from model.inference.fitting import Fit
 from model.inference.mask_stack import MaskStack
+from model.inference.objective import Place
 from model.inference.observations import Observations
 from model.inference.posterior import model_logits
 from model.inference.surface import canonical_box
@@ -113,16 +113,19 @@ def discrepancy_of(
     )
 
 
-def observed_anew(model: ShapeModel, found: Fit, latent: Float[np.ndarray, "d"], pose: Pose) -> Discrepancy | None:
-    """The fit's discrepancy as it is from another code and pose, which the same contours hold; None without one."""
+def observed_anew(model: ShapeModel, found: Fit, places: Sequence[Place]) -> list[Discrepancy | None]:
+    """The fit's discrepancy as it is from each of other codes and poses, which the same contours hold; None without."""
     made = found.discrepancy
-    if made is None:
-        return None
-    moved = pose.to_canonical(found.pose.to_world(made.points))
-    scale = REACH_MM * made.slope
-    before = np.tanh(model.decoder.logits(found.latent[None], made.points[None])[0] / scale)
-    after = np.tanh(model.decoder.logits(latent[None], moved[None])[0] / scale)
-    return replace(made, points=moved, residuals=made.residuals + REACH_MM * (before - after))
+    if made is None or not places:
+        return [None for _ in places]
+    world = found.pose.to_world(made.points)
+    points = np.stack([made.points, *(place.pose.to_canonical(world) for place in places)])
+    logits = model.decoder.logits(np.stack([found.latent, *(place.latent for place in places)]), points)
+    levels = REACH_MM * np.tanh(logits / (REACH_MM * made.slope))
+    return [
+        replace(made, points=there, residuals=made.residuals + levels[0] - level)
+        for there, level in zip(points[1:], levels[1:], strict=True)
+    ]
 
 
 @dataclass(frozen=True)

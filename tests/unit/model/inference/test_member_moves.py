@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from model.inference.discrepancy.conditioning import observed_anew
 from model.inference.ensemble import fit_ensemble
 from model.inference.member_moves import member_moves
+from model.inference.objective import Place
 from model.inference.posterior import fitted_jacobians, fitted_logits
 from model.inference.surface import surface_of
 from tests.few_planes import MODEL, OBSERVATIONS, fitted
@@ -15,7 +16,8 @@ from tests.few_planes import MODEL, OBSERVATIONS, fitted
 
 def held(found, latent_step, shift):
     latent, pose = found.latent + latent_step, replace(found.pose, position=found.pose.position + shift)
-    return replace(found, latent=latent, pose=pose, discrepancy=observed_anew(MODEL, found, latent, pose))
+    (seen,) = observed_anew(MODEL, found, [Place(latent, pose)])
+    return replace(found, latent=latent, pose=pose, discrepancy=seen)
 
 
 def surface(found):
