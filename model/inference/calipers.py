@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.distance import pdist, squareform
+from scipy.spatial.distance import cdist
 
 from model.errors import InvalidParameter
 from model.inference.estimates import Estimate, estimate_of
@@ -27,7 +27,7 @@ USUAL_EXTENTS = (*AXES, LONGEST)
 USUAL_TEXT = ", ".join(USUAL_EXTENTS)
 #: Extents that may be asked for together, at most.
 MOST_EXTENTS = 32
-#: A hull with more corners than this is thinned out before all distances between them are taken.
+#: More points than this that the longest diameter may join are thinned out before all their distances are taken.
 MOST_CORNERS = 2000
 
 _NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
@@ -115,10 +115,28 @@ def _farthest(mesh: Mesh) -> tuple[int, int]:
         corners = np.asarray(ConvexHull(mesh.vertices).vertices, np.int64)
     except QhullError:  # a surface without volume
         corners = np.arange(len(mesh.vertices))
+    corners = corners[_far_out(mesh.vertices[corners])]
     corners = corners[:: -(-len(corners) // MOST_CORNERS)]
-    gaps = squareform(pdist(mesh.vertices[corners]))
+    gaps = cdist(mesh.vertices[corners], mesh.vertices[corners])
     first, second = np.unravel_index(int(np.argmax(gaps)), gaps.shape)
     # From low to high along the axis in which they differ most, so that the direction does not depend on the order.
     a, b = int(corners[first]), int(corners[second])
     step = mesh.vertices[b] - mesh.vertices[a]
     return (a, b) if step[np.argmax(np.abs(step))] >= 0 else (b, a)
+
+
+def _far_out(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "k"]:
+    """Numbers of the points that the longest of their distances may join.
+
+    None is longer than a point's distance from any centre and the largest such distance together; a long one is found
+    by going to the point that is farthest from some point, and to the one farthest from that.
+    """
+    start = points[np.argmax(_distances(points, points[0]))]
+    gaps = _distances(points, start)
+    end = points[np.argmax(gaps)]
+    away = _distances(points, (start + end) / 2.0)
+    return np.flatnonzero(away + away.max() >= gaps.max() * (1.0 - 1e-9))
+
+
+def _distances(points: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n"]:
+    return np.asarray(np.linalg.norm(points - origin, axis=1))

@@ -54,7 +54,8 @@ def extract_surface(
         lower, upper: corners of the box (mm).
         step_mm: distance of the finest nodes.
         coarse_factor: coarsest step in finest steps, a power of two; by the size of the box when None.
-        gradient: values and gradients at points; moves the vertices onto the surface and gives the normals.
+        gradient: values and gradients at points; moves the vertices onto the surface and gives the normals. It is
+            called once, with all vertices in their order.
         steepest: bound of the field's slope (1/mm) that the caller vouches for; none is needed.
         keep_specks: keep all components; only the one of largest volume otherwise (`largest_component`
             counts those that go).

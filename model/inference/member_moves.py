@@ -15,7 +15,7 @@ from model.bundle import ShapeModel
 from model.inference.discrepancy.process import REACH_MM
 from model.inference.fitting import Fit, pose_offset
 from model.inference.mesh import Mesh
-from model.inference.posterior import fitted_jacobians, model_logits, normal_displacements
+from model.inference.posterior import FieldDerivatives, fitted_jacobians, model_logits, normal_displacements
 
 #: Members' fields are evaluated at one vertex of so many.
 EVERY = 5
@@ -25,9 +25,15 @@ NEIGHBOURS = 4
 APART_MM = 2.0
 
 
-def member_moves(model: ShapeModel, found: Fit, members: Sequence[Fit], mesh: Mesh) -> Float[np.ndarray, "v m"]:
-    """Outward movement (mm) of each vertex from the fit's surface to each member's."""
-    _, by_parameter, by_point = fitted_jacobians(model, found, mesh.vertices)
+def member_moves(
+    model: ShapeModel, found: Fit, members: Sequence[Fit], mesh: Mesh, known: FieldDerivatives | None = None
+) -> Float[np.ndarray, "v m"]:
+    """Outward movement (mm) of each vertex from the fit's surface to each member's.
+
+    Args:
+        known: derivatives of the fit's field at the vertices, where somebody has them already.
+    """
+    _, by_parameter, by_point = fitted_jacobians(model, found, mesh.vertices, known)
     steps = np.stack([_step(found, member) for member in members], axis=1)
     linear = normal_displacements(by_parameter @ steps, by_point)
     rows = np.arange(0, len(linear), EVERY)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -134,12 +134,26 @@ def largest_component(mesh: Mesh) -> tuple[Mesh, int]:
 
     Walls of enclosed cavities are components of their own and are removed as well.
     """
+    keep, removed = of_largest_component(mesh)
+    return (subset(mesh, keep) if removed else mesh), removed
+
+
+def of_largest_component(mesh: Mesh) -> tuple[Bool[np.ndarray, "v"], int]:
+    """Which vertices `largest_component` keeps, and how many components it removes."""
     count, component = components(mesh)
     if count <= 1:
-        return mesh, 0
+        return np.ones(len(mesh.vertices), bool), 0
     a, b, c = _corners(mesh.vertices - _middle(mesh.vertices), mesh.faces)
     enclosed = np.bincount(component[mesh.faces[:, 0]], np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=count)
-    return _subset(mesh, component == int(np.argmax(enclosed))), count - 1
+    return component == int(np.argmax(enclosed)), count - 1
+
+
+def subset(mesh: Mesh, keep: Bool[np.ndarray, "v"]) -> Mesh:
+    """Some of the vertices, and the faces between them."""
+    number = np.cumsum(keep) - 1
+    faces = number[mesh.faces[keep[mesh.faces[:, 0]]]]
+    scalars = {name: values[keep] for name, values in mesh.scalars.items()}
+    return Mesh(mesh.vertices[keep], faces, mesh.normals[keep], scalars)
 
 
 def to_trimesh(mesh: Mesh) -> trimesh.Trimesh:
@@ -155,13 +169,6 @@ def from_trimesh(mesh: trimesh.Trimesh) -> Mesh:
     scalars = {name: values.reshape(-1) for name, values in attributes.items() if values.size == len(mesh.vertices)}
     normals = np.array(mesh.vertex_normals, float)
     return Mesh(np.array(mesh.vertices, float), np.array(mesh.faces, np.int64), normals, scalars)
-
-
-def _subset(mesh: Mesh, keep: np.ndarray) -> Mesh:
-    number = np.cumsum(keep) - 1
-    faces = number[mesh.faces[keep[mesh.faces[:, 0]]]]
-    scalars = {name: values[keep] for name, values in mesh.scalars.items()}
-    return Mesh(mesh.vertices[keep], faces, mesh.normals[keep], scalars)
 
 
 def _middle(vertices: np.ndarray) -> np.ndarray:

@@ -5,8 +5,10 @@ user asks for is first order in the parameters: a logit moves by its Jacobian ti
 point moves along its normal by that change over the length of the field's gradient.
 """
 
+from dataclasses import dataclass, fields
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
@@ -36,31 +38,71 @@ def fitted_logits(model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"])
     return fit.discrepancy.corrected(logits, fit.pose.to_canonical(points))
 
 
+@dataclass(frozen=True)
+class FieldDerivatives:
+    """A fitted field and its derivatives at points of the canonical frame, before the contours hold it.
+
+    Attributes:
+        logits: (n,) of the shape, its discrepancy included.
+        by_parameter: (n, p) by (latent, pose step), where the discrepancy does not give way.
+        by_point: (n, 3) by canonical point (1/mm).
+    """
+
+    logits: Float[np.ndarray, "n"]
+    by_parameter: Float[np.ndarray, "n p"]
+    by_point: Float[np.ndarray, "n 3"]
+
+    def of(self, rows: Bool[np.ndarray, "n"]) -> "FieldDerivatives":
+        """Those at some of the points."""
+        return FieldDerivatives(self.logits[rows], self.by_parameter[rows], self.by_point[rows])
+
+
+def field_derivatives(model: ShapeModel, fit: Fit, canonical: Float[np.ndarray, "n 3"]) -> FieldDerivatives:
+    """The fitted field and its derivatives at canonical points (mm)."""
+    if not len(canonical):
+        return FieldDerivatives(np.zeros(0), np.zeros((0, len(fit.precision))), np.zeros((0, 3)))
+    parts = [_derivatives(model, fit, chunk) for chunk in _chunks(canonical)]
+    if len(parts) == 1:
+        return parts[0]
+    names = [part.name for part in fields(FieldDerivatives)]
+    return FieldDerivatives(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
 def fitted_jacobians(
-    model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]
+    model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"], known: FieldDerivatives | None = None
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n p"], Float[np.ndarray, "n 3"]]:
-    """Logits as `fitted_logits` gives them, their derivatives by (latent, pose step), and by world point (1/mm)."""
-    if not len(points):
-        return np.zeros(0), np.zeros((0, len(fit.precision))), np.zeros((0, 3))
-    parts = [_jacobians(model, fit, chunk) for chunk in _chunks(points)]
-    logits, by_parameter, by_point = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return logits, by_parameter, by_point
+    """Logits as `fitted_logits` gives them, their derivatives by (latent, pose step), and by world point (1/mm).
 
-
-def _jacobians(
-    model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n p"], Float[np.ndarray, "n 3"]]:
+    Args:
+        points: world mm.
+        known: the field's derivatives at these points, where somebody has them already.
+    """
     canonical = fit.pose.to_canonical(points)
+    found = field_derivatives(model, fit, canonical) if known is None else known
+    return found.logits, _held(fit, canonical, found.by_parameter), fit.pose.gradient_to_world(found.by_point)
+
+
+def _derivatives(model: ShapeModel, fit: Fit, canonical: Float[np.ndarray, "n 3"]) -> FieldDerivatives:
     logits, by_latent, by_point = (
         value[0] for value in model.decoder.logits_and_jacobians(fit.latent[None], canonical[None])
     )
     by_parameter = np.concatenate([by_latent, fit.pose.jacobian(canonical, by_point)], axis=1)
-    if fit.discrepancy is not None:
-        share = fit.discrepancy.shrinkage(logits)[:, None]
-        by_parameter = share * by_parameter - fit.discrepancy.slope * fit.discrepancy.carried(canonical)
-        by_point = share * by_point + fit.discrepancy.slope * fit.discrepancy.gradient(canonical)
-        logits = fit.discrepancy.corrected(logits, canonical)
-    return logits, by_parameter, fit.pose.gradient_to_world(by_point)
+    if fit.discrepancy is None:
+        return FieldDerivatives(logits, by_parameter, by_point)
+    share, slope = fit.discrepancy.shrinkage(logits)[:, None], fit.discrepancy.slope
+    mean, gradient = fit.discrepancy.mean_and_gradient(canonical)
+    return FieldDerivatives(
+        fit.discrepancy.levels(logits) + slope * mean, share * by_parameter, share * by_point + slope * gradient
+    )
+
+
+def _held(
+    fit: Fit, canonical: Float[np.ndarray, "n 3"], by_parameter: Float[np.ndarray, "n p"]
+) -> Float[np.ndarray, "n p"]:
+    """Derivatives of the field that the contours hold: around them the discrepancy gives way to a parameter."""
+    if fit.discrepancy is None or not len(canonical):
+        return by_parameter
+    return np.asarray(by_parameter - fit.discrepancy.slope * fit.discrepancy.carried(canonical))
 
 
 def _chunks(points: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "m 3"]]:

@@ -19,9 +19,9 @@ from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
 from model.inference.mesh import Mesh
 from model.inference.objective import Place, reweighted
 from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
-from model.inference.posterior import fitted_logits, laplace_covariance
+from model.inference.posterior import FieldDerivatives, fitted_logits, laplace_covariance
 from model.inference.reliability import figures_of, less_trusting, reliability_warnings, thickness_warnings
-from model.inference.surface import surface_of
+from model.inference.surface import differentiated_surface, surface_of
 from model.inference.thick_slices import through_thickness
 from model.inference.typicality import (
     predictive_probabilities,
@@ -138,7 +138,7 @@ def reconstruct(
     model, settled, observations = _settled(model, stacks, drawing, FitOptions(mirror=options.mirror), usual)
     found = corrected(model, settled, stacks, drawing, discrepancy_prior(model.manifest, options.fidelity))
     watch("surface")
-    mesh = surface_of(model, found.latent, found.pose, options.resolution_mm, found.discrepancy)
+    mesh, derivatives = _surface(model, found, options)
     if mesh.is_empty:
         raise InvalidMask(
             f"The drawing has nothing in common with a {model.manifest.structure}, no shape of it comes near; "
@@ -147,7 +147,7 @@ def reconstruct(
         )
     watch("uncertainty")
     state = _state(model, observations, found, options)
-    spread = surface_spread(model, state, mesh)
+    spread = surface_spread(model, state, mesh, derivatives)
     sd_mm = None if spread is None else spread.sd()
     if sd_mm is not None:
         mesh = replace(mesh, scalars={"surface_sd_mm": sd_mm})
@@ -189,6 +189,13 @@ def _settled(
     found, observations = through_thickness(model, fit(model, drawing, options), stacks, drawing, options)
     trusting, found = less_trusting(model, found, stacks, observations, options, usual)
     return trusting, found, observations
+
+
+def _surface(model: ShapeModel, found: Fit, options: Options) -> tuple[Mesh, FieldDerivatives | None]:
+    """The surface, and what its uncertainty will need of the field at its vertices."""
+    if options.uncertainty == "none":
+        return surface_of(model, found.latent, found.pose, options.resolution_mm, found.discrepancy), None
+    return differentiated_surface(model, found, options.resolution_mm)
 
 
 def _check(options: Options) -> None:

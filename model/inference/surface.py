@@ -7,8 +7,10 @@ from model.bundle import ShapeModel
 from model.errors import InvalidParameter
 from model.geometry import Grid, Pose
 from model.inference.discrepancy.process import Discrepancy
-from model.inference.isosurface import extract_surface
-from model.inference.mesh import Mesh, extents, transformed
+from model.inference.fitting import Fit
+from model.inference.isosurface import FieldWithGradient, extract_surface
+from model.inference.mesh import Mesh, extents, of_largest_component, subset, transformed
+from model.inference.posterior import FieldDerivatives, field_derivatives
 
 #: Room around the box of all training shapes in which a surface is looked for.
 BOX_MARGIN_MM = 6.0
@@ -34,19 +36,55 @@ def surface_of(
         discrepancy: added to the decoder's field.
         keep_specks: keep all components; only the one of largest volume otherwise.
     """
+
+    def gradient(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+        logits, by_point = (part[0] for part in model.decoder.logits_and_gradients(latent[None], points[None]))
+        if discrepancy is None:
+            return logits, by_point
+        mean, slopes = discrepancy.mean_and_gradient(points)
+        held = discrepancy.shrinkage(logits)[:, None] * by_point + discrepancy.slope * slopes
+        return discrepancy.levels(logits) + discrepancy.slope * mean, held
+
+    return _extracted(model, latent, pose, step_mm, discrepancy, gradient, keep_specks=keep_specks)
+
+
+def differentiated_surface(
+    model: ShapeModel, found: Fit, step_mm: float | None = None
+) -> tuple[Mesh, FieldDerivatives | None]:
+    """The surface of a fit as `surface_of` has it, and the field's derivatives at its vertices; None without any.
+
+    Vertices and normals need the derivatives by point anyway; those by parameter come with them for little. They are
+    taken just before the last step of the vertices, which is far too short to alter them.
+    """
+    taken: list[FieldDerivatives] = []
+
+    def gradient(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+        taken.append(field_derivatives(model, found, points))
+        return taken[-1].logits, taken[-1].by_point
+
+    whole = _extracted(model, found.latent, found.pose, step_mm, found.discrepancy, gradient, keep_specks=True)
+    if not taken:
+        return whole, None
+    keep, removed = of_largest_component(whole)
+    return (subset(whole, keep), taken[-1].of(keep)) if removed else (whole, taken[-1])
+
+
+def _extracted(
+    model: ShapeModel,
+    latent: Float[np.ndarray, "d"],
+    pose: Pose,
+    step_mm: float | None,
+    discrepancy: Discrepancy | None,
+    gradient: FieldWithGradient,
+    *,
+    keep_specks: bool,
+) -> Mesh:
     half = canonical_box(model)
     step = (step_mm or model.manifest.resolution_mm) * float(np.exp(pose.log_scale))
 
     def field(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         logits = model.decoder.logits(latent[None], points[None])[0]
         return logits if discrepancy is None else discrepancy.corrected(logits, points)
-
-    def gradient(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-        logits, by_point = model.decoder.logits_and_gradients(latent[None], points[None])
-        if discrepancy is None:
-            return logits[0], by_point[0]
-        slopes = discrepancy.shrinkage(logits[0])[:, None] * by_point[0]
-        return discrepancy.corrected(logits[0], points), slopes + discrepancy.slope * discrepancy.gradient(points)
 
     mesh = extract_surface(field, -half, half, step, gradient=gradient, keep_specks=keep_specks)
     affine = np.eye(4)

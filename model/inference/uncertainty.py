@@ -18,6 +18,7 @@ from model.inference.fitting import Fit
 from model.inference.member_moves import member_moves
 from model.inference.mesh import Mesh, area_cm2, area_gradient, vertex_areas, volume_ml
 from model.inference.posterior import (
+    FieldDerivatives,
     fitted_jacobians,
     fitted_logits,
     logit_variance,
@@ -53,18 +54,24 @@ class ShapeState:
         return self.fits[1:]
 
 
-def surface_spread(model: ShapeModel, state: ShapeState, mesh: Mesh) -> SurfaceSpread | None:
-    """Posterior of the vertices' outward movement, or None without uncertainty."""
+def surface_spread(
+    model: ShapeModel, state: ShapeState, mesh: Mesh, known: FieldDerivatives | None = None
+) -> SurfaceSpread | None:
+    """Posterior of the vertices' outward movement, or None without uncertainty.
+
+    Args:
+        known: derivatives of the fit's field at the vertices, where somebody has them already.
+    """
     found = state.fits[0]
     if state.covariance is not None:
-        _, by_parameter, by_point = fitted_jacobians(model, found, mesh.vertices)
+        _, by_parameter, by_point = fitted_jacobians(model, found, mesh.vertices, known)
         scale, offset = calibrated_scale(model)
         factors = scale * normal_displacements(by_parameter, by_point) @ np.linalg.cholesky(state.covariance)
         if offset > 0.0:
             factors = np.hstack([factors, np.full((len(factors), 1), offset)])
         return SurfaceSpread(factors, _local_spread(found, mesh, by_point, scale))
     if state.members:
-        moves = member_moves(model, found, state.members, mesh)
+        moves = member_moves(model, found, state.members, mesh, known)
         return SurfaceSpread((moves - moves.mean(axis=1, keepdims=True)) / np.sqrt(len(state.members) - 1))
     return None
 

@@ -27,8 +27,8 @@ from model.inference.discrepancy.grouping import cells_of, means_of
 REACH_MM = 3.0
 #: Steps of the lattice that holds the process, of its shortest length.
 LATTICE_STEPS = 1.75
-#: Half step of the differences that give the gradient (mm).
-DIFFERENCE_MM = 0.2
+#: Step of the differences that give the gradient (mm).
+DIFFERENCE_MM = 0.02
 #: Size of the cells whose points are taken together in a functional, in shortest lengths.
 GROUP_SHARE = 0.8
 #: Contour points that tell the variance at a point.
@@ -65,8 +65,12 @@ class Discrepancy:
 
     def corrected(self, logits: Float[np.ndarray, "m"], canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
         """``F`` where the decoder gives these logits."""
+        return self.levels(logits) + self.slope * self.mean(canonical)
+
+    def levels(self, logits: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """``g m``."""
         scale = REACH_MM * self.slope
-        return np.asarray(scale * np.tanh(logits / scale) + self.slope * self.mean(canonical))
+        return np.asarray(scale * np.tanh(logits / scale))
 
     def shrinkage(self, logits: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
         """Derivative of ``g m`` by the logit."""
@@ -82,11 +86,13 @@ class Discrepancy:
         """Posterior means (mm) had the process been observed to be these at its points, one set a column."""
         return np.asarray(self.covariance.between(canonical, self.points) @ cho_solve(self._factor, residuals))
 
-    def gradient(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
-        """Gradient of the posterior mean, by central differences."""
-        steps = DIFFERENCE_MM * np.eye(3)
-        changes = [self.mean(canonical + step) - self.mean(canonical - step) for step in steps]
-        return np.asarray(np.stack(changes, axis=1) / (2.0 * DIFFERENCE_MM))
+    def mean_and_gradient(
+        self, canonical: Float[np.ndarray, "m 3"]
+    ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 3"]]:
+        """Posterior mean (mm) and its gradient, by differences."""
+        mean = self.mean(canonical)
+        changes = [self.mean(canonical + step) - mean for step in DIFFERENCE_MM * np.eye(3)]
+        return mean, np.stack(changes, axis=1) / DIFFERENCE_MM
 
     def variance(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
         """Posterior variance (mm^2), given the `NEAREST` contour points (Vecchia's approximation, 1988).

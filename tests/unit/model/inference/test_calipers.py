@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.distance import cdist
 
 from model.errors import InvalidParameter
 from model.geometry import Pose
@@ -38,11 +39,19 @@ def test_width_of_an_ellipsoid_in_any_direction(vector):
     np.testing.assert_allclose(found.direction, direction, atol=1e-9)
 
 
+def test_the_longest_diameter_is_the_largest_of_all_distances():
+    for vertices in (MESH.vertices, np.random.default_rng(0).standard_normal((300, 3)) * (1.0, 1.02, 1.01)):
+        found = measure_extents(replace(MESH, vertices=vertices, normals=vertices), None, ["longest"])[0]
+        assert found.extent_mm.value == pytest.approx(cdist(vertices, vertices).max(), abs=1e-9)
+
+
 def test_the_longest_diameter_turns_with_the_surface():
+    sheared = MESH.vertices + 0.05 * MESH.vertices[:, [1]] * np.array([1.0, 0.0, 1.0])  # no two diameters alike
+    mesh = replace(MESH, vertices=sheared)
     turn = rotation(40.0, (1.0, 2.0, 3.0))
     affine = np.eye(4)
     affine[:3, :3] = turn
-    before, after = (measure_extents(mesh, None, ["longest"])[0] for mesh in (MESH, transformed(MESH, affine)))
+    before, after = (measure_extents(one, None, ["longest"])[0] for one in (mesh, transformed(mesh, affine)))
     assert after.extent_mm.value == pytest.approx(before.extent_mm.value, abs=1e-9)
     assert abs(np.dot(after.direction, turn @ before.direction)) == pytest.approx(1.0, abs=1e-3)
 

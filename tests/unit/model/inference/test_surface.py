@@ -1,5 +1,7 @@
 """The surface of a code and a pose, against the ellipsoid that they stand for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,14 +9,32 @@ from hypothesis import strategies as st
 
 from model.geometry import Pose
 from model.inference.mesh import area_cm2, extents, is_watertight, volume_ml
-from model.inference.surface import BOX_MARGIN_MM, canonical_box, covering_grid, surface_of
-from tests.analytic_model import bent_model, ellipsoid_model
+from model.inference.posterior import fitted_jacobians
+from model.inference.surface import BOX_MARGIN_MM, canonical_box, covering_grid, differentiated_surface, surface_of
+from tests import few_planes
+from tests.analytic_model import STEEPNESS, EllipsoidDecoder, bent_model, ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import rotation
 
 MODEL = ellipsoid_model()
 POSE = Pose(np.array([50.0, -30.0, 7.0]), rotation(35.0, (1.0, 2.0, 3.0)), 0.1, mirrored=True)
 LATENT = np.array([0.5, -0.8, 1.0])
+
+
+class SpeckDecoder(EllipsoidDecoder):
+    """The ellipsoid, and a ball of 2 mm away from it."""
+
+    def logits_and_jacobians(self, latent, points):
+        logits, by_latent, by_point = super().logits_and_jacobians(latent, points)
+        offset = points - np.array([0.0, 0.0, 16.0])
+        radius = np.linalg.norm(offset, axis=-1, keepdims=True)
+        ball = STEEPNESS * (1.0 - radius[..., 0] / 2.0)
+        other = (ball > logits)[..., None]
+        slopes = np.where(other, -STEEPNESS / 2.0 * offset / radius, by_point)
+        return np.maximum(logits, ball), np.where(other, 0.0, by_latent), slopes
+
+    def logits(self, latent, points):
+        return self.logits_and_jacobians(latent, points)[0]
 
 
 def ellipsoid_of(latent, pose):
@@ -100,3 +120,36 @@ def test_covering_grid_leaves_the_margin_on_all_sides(spacing):
     assert (last >= upper + 4.0 - 1e-9).all()
     assert (last < upper + 4.0 + spacing).all()
     np.testing.assert_allclose(grid.spacing, spacing)
+
+
+@pytest.mark.parametrize("fidelity", [0.0, 0.7])
+def test_a_differentiated_surface_is_the_same_and_knows_the_field_at_its_vertices(fidelity):
+    found = few_planes.fitted(fidelity)
+    mesh, derivatives = differentiated_surface(few_planes.MODEL, found, 0.7)
+    plain = surface_of(few_planes.MODEL, found.latent, found.pose, 0.7, found.discrepancy)
+    np.testing.assert_array_equal(mesh.faces, plain.faces)
+    np.testing.assert_allclose(mesh.vertices, plain.vertices, atol=1e-5)
+    np.testing.assert_allclose(mesh.normals, plain.normals, atol=1e-4)
+    anew, known = (fitted_jacobians(few_planes.MODEL, found, mesh.vertices, one) for one in (None, derivatives))
+    assert np.abs(known[0]).max() < 0.01 * np.linalg.norm(anew[2], axis=1).min()  # within 0.01 mm of the surface
+    for there, here in zip(anew[1:], known[1:], strict=True):
+        assert np.abs(there - here).max() < 5e-3 * np.abs(there).max()
+
+
+def test_derivatives_are_those_of_the_vertices_that_stay_when_specks_go():
+    model = replace(MODEL, decoder=SpeckDecoder())
+    found = replace(few_planes.fitted(0.0), latent=LATENT, pose=Pose())
+    whole = surface_of(model, LATENT, Pose(), 0.7, keep_specks=True)
+    mesh, derivatives = differentiated_surface(model, found, 0.7)
+    assert len(mesh.vertices) < len(whole.vertices)
+    assert len(derivatives.logits) == len(mesh.vertices)
+    assert np.abs(derivatives.logits).max() < 0.05
+    outward = -derivatives.by_point / np.linalg.norm(derivatives.by_point, axis=1, keepdims=True)
+    np.testing.assert_allclose(outward, mesh.normals, atol=1e-6)
+
+
+def test_nothing_has_no_derivatives():
+    found = replace(few_planes.fitted(0.0), latent=np.full(3, -60.0))
+    mesh, derivatives = differentiated_surface(MODEL, found)
+    assert mesh.is_empty
+    assert derivatives is None
