@@ -73,6 +73,22 @@ def test_a_known_metric_is_found():
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("size", [8, 40])
+def test_directions_that_move_little_are_measured_too(size):
+    """Movements over three orders of magnitude: each axis of the metric is as long as the surface moves along it."""
+    generator = torch.Generator().manual_seed(size)
+    scales = torch.logspace(0, -3, size, dtype=torch.float64)
+    mixing = torch.linalg.qr(torch.randn(size, size, generator=generator, dtype=torch.float64)).Q
+    drawn = [torch.randn(300, size, generator=generator, dtype=torch.float64) for _ in range(8)]
+    moved = [one.abs().sqrt() * one * scales for one in drawn]
+    squares, axes = torch.linalg.eigh(length_metric([found @ mixing for found in moved]))
+    means = torch.stack([(found @ mixing @ axes).abs().mean(dim=0) for found in moved]).square().mean(dim=0).sqrt()
+    assert (squares > 0).all()
+    ratio = squares.sqrt() / means
+    assert 0.7 < float(ratio.min()) <= float(ratio.max()) < 1.6
+
+
+@torch.no_grad()
 def test_movements_are_those_of_the_surface(parts):
     """A small step of the code against the distance at which the surface is found again along its normals."""
     decoder, codes, _, _ = parts
