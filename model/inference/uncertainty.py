@@ -66,9 +66,10 @@ def surface_spread(
     if state.covariance is not None:
         _, by_parameter, by_point = fitted_jacobians(model, found, mesh.vertices, known)
         scale, offset = calibrated_scale(model)
-        factors = scale * normal_displacements(by_parameter, by_point) @ np.linalg.cholesky(state.covariance)
-        if offset > 0.0:
-            factors = np.hstack([factors, np.full((len(factors), 1), offset)])
+        size = len(state.covariance)
+        factors = np.full((len(mesh.vertices), size + 1), offset)
+        spread = scale * np.linalg.cholesky(state.covariance)
+        np.matmul(normal_displacements(by_parameter, by_point), spread, out=factors[:, :size])
         return SurfaceSpread(factors, _local_spread(found, mesh, by_point, scale))
     if state.members:
         moves = member_moves(model, found, state.members, mesh, known)
