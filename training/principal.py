@@ -92,24 +92,28 @@ def length_metric(moved: Sequence[Float[Tensor, "_ k"]]) -> Float[Tensor, "k k"]
     identity: it stays small where the steps do not tell.
     """
     size = moved[0].shape[1]
-    rows, columns = torch.triu_indices(size, size)
-    count = max(STEPS, STEPS_EACH * len(rows))
+    count = max(STEPS, STEPS_EACH * size * (size + 1) // 2)
     steps = torch.randn(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     squares = torch.stack([(found @ steps.T).abs().mean(dim=0).square() for found in moved]).mean(dim=0)
-    squares = squares.clamp(min=float(squares.max()) * 1e-12)
+    lengths = squares.clamp(min=float(squares.max()) * 1e-12).sqrt()
     values, vectors = torch.linalg.eigh(torch.stack([found.T @ found / len(found) for found in moved]).mean(dim=0))
-    whitened = steps @ vectors * values.clamp(min=0.0).sqrt()
-    ratio = whitened.square().sum(dim=1) / squares
+    roots = values.clamp(min=0.0).sqrt()[:, None] * vectors.T
+    whitened = steps @ roots.T / lengths[:, None]
+    ratio = whitened.square().sum(dim=1)
     scale = ratio.sum() / ratio.square().sum()
-    products = whitened[:, rows] * whitened[:, columns] * torch.where(rows == columns, 1.0, 2.0)
-    design = scale * products / squares[:, None]
-    normal = design.T @ design + DEPARTURE_WEIGHT * torch.eye(len(rows), dtype=torch.float64)
-    numbers = torch.linalg.solve(normal, design.T @ (1.0 - scale * ratio))
-    departure = torch.zeros(size, size, dtype=torch.float64)
-    departure[rows, columns] = numbers
-    departure = departure + departure.T - torch.diag(departure.diag())
-    roots = (scale * values.clamp(min=0.0)).sqrt()[:, None] * vectors.T
-    return roots.T @ (torch.eye(size, dtype=torch.float64) + departure) @ roots
+    departure = _fitted_form(scale.sqrt() * whitened, 1.0 - scale * ratio)
+    return torch.as_tensor(scale * roots.T @ (torch.eye(size, dtype=torch.float64) + departure) @ roots)
+
+
+def _fitted_form(points: Float[Tensor, "n k"], values: Float[Tensor, "n"]) -> Float[Tensor, "k k"]:
+    """Symmetric ``D`` for which ``x^T D x`` comes near to values at points, kept small by `DEPARTURE_WEIGHT`."""
+    size = points.shape[1]
+    rows, columns = torch.triu_indices(size, size)
+    products = points[:, rows] * points[:, columns] * torch.where(rows == columns, 1.0, 2.0)
+    normal = products.T @ products + DEPARTURE_WEIGHT * torch.eye(len(rows), dtype=torch.float64)
+    form = torch.zeros(size, size, dtype=torch.float64)
+    form[rows, columns] = torch.linalg.solve(normal, products.T @ values)
+    return form + form.T - torch.diag(form.diag())
 
 
 @torch.no_grad()
