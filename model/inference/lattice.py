@@ -21,7 +21,7 @@ class SparseLattice:
     """Nodes and cells of a regular grid, of which few are in use.
 
     A cell has the number of its first corner. Memory is 2.5 KiB for each brick of 8 x 8 x 8 nodes that holds one in
-    use, and 4 bytes for each brick of the whole grid.
+    use, and 8 bytes for each brick of the whole grid.
 
     Args:
         shape: nodes along each axis.
@@ -30,18 +30,19 @@ class SparseLattice:
     def __init__(self, shape: Int[np.ndarray, "3"]) -> None:
         # A layer of bricks around the grid, and the first brick of all, stay without values: there nothing was set.
         self._bricks = -(-np.asarray(shape) // _EDGE) + 2
-        self._table = np.zeros(int(np.prod(self._bricks)), np.int32)
+        # Of each brick of the whole grid, where its nodes stand in the storage.
+        self._table = np.zeros(int(np.prod(self._bricks)), np.int64)
         self._first: Int[np.ndarray, "k 3"] = np.zeros((1, 3), np.int64)
         self._values = np.full(_SIZE, np.nan, np.float32)
         self._cells = np.zeros(_SIZE, bool)
 
     def values(self, nodes: Nodes) -> Float[np.ndarray, "_"]:
         """Values of nodes; NaN where none was set, and outside the grid."""
-        return np.asarray(self._values[self._address(*self._places(nodes, (0,), (0,), (0,)))].reshape(-1))
+        return np.asarray(self._values[self._address(self._keys(nodes, (0,), (0,), (0,)))].reshape(-1))
 
     def around(self, cells: Nodes, *offsets: Sequence[int]) -> Float[np.ndarray, "_ i j k"]:
         """Values at nodes of some offsets along each axis from each cell's first corner."""
-        return np.asarray(self._values[self._address(*self._places(cells, *offsets))])
+        return np.asarray(self._values[self._address(self._keys(cells, *offsets))])
 
     def corner_values(self, cells: Nodes) -> Float[np.ndarray, "_ 8"]:
         """Values at the corners of cells, in the order of `CORNERS`."""
@@ -73,31 +74,32 @@ class SparseLattice:
         mark &= np.isnan(self._values)
         return self._nodes(np.flatnonzero(mark))
 
-    def _places(self, cells: Nodes, *offsets: Sequence[int]) -> tuple[Addresses, Addresses]:
-        """Brick of the table, and place in the brick, of each offset node."""
-        brick: Addresses = np.zeros(1, np.int32)
-        place: Addresses = np.zeros(1, np.int32)
+    def _keys(self, cells: Nodes, *offsets: Sequence[int]) -> Addresses:
+        """Brick of the whole grid, and place in the brick, of each offset node in one number."""
+        key: Addresses = np.zeros(1, np.int64)
         for axis, offset in enumerate(offsets):
             shape = [-1 if other == axis else 1 for other in range(3)]
-            nodes = cells[:, axis].astype(np.int32).reshape(-1, 1, 1, 1) + np.asarray(offset, np.int32).reshape(shape)
-            stride = int(np.prod(self._bricks[axis + 1 :]))
-            brick = brick + ((nodes >> BITS) + 1) * stride
-            place = place + ((nodes & _REST) << (2 - axis) * BITS)
-        return brick, place
+            nodes = cells[:, axis].reshape(-1, 1, 1, 1) + np.asarray(offset, np.int64).reshape(shape)
+            stride = int(np.prod(self._bricks[axis + 1 :])) << 3 * BITS
+            key = key + (((nodes >> BITS) + 1) * stride + ((nodes & _REST) << (2 - axis) * BITS))
+        return key
 
-    def _address(self, brick: Addresses, place: Addresses) -> Addresses:
-        return np.asarray(self._table[brick].astype(np.int64) * _SIZE + place)
+    def _address(self, keys: Addresses) -> Addresses:
+        address: Addresses = self._table[keys >> 3 * BITS]
+        address += keys & (_SIZE - 1)
+        return address
 
     def _reserved(self, cells: Nodes, offset: Sequence[int]) -> Addresses:
         """Place of each node in the storage, with bricks made where there were none."""
-        brick, place = self._places(cells, offset, offset, offset)
-        missing = brick[self._table[brick] == 0]
+        keys = self._keys(cells, offset, offset, offset)
+        bricks = keys >> 3 * BITS
+        missing = bricks[self._table[bricks] == 0]
         if len(missing):
             self._grow(np.unique(missing))
-        return self._address(brick, place)
+        return self._address(keys)
 
     def _grow(self, bricks: Addresses) -> None:
-        self._table[bricks] = len(self._first) + np.arange(len(bricks))
+        self._table[bricks] = (len(self._first) + np.arange(len(bricks))) << 3 * BITS
         first = (np.stack(np.unravel_index(bricks, tuple(self._bricks)), axis=1) - 1) * _EDGE
         self._first = np.concatenate([self._first, first])
         self._values = np.concatenate([self._values, np.full(len(bricks) * _SIZE, np.nan, np.float32)])

@@ -15,11 +15,13 @@ class LocalSpread:
     Attributes:
         discrepancy: the process.
         canonical: (v, 3) vertices (canonical mm).
+        variance: (v,) of the process there (mm^2).
         reach: (v,) outward movement (mm) of a vertex for one mm of the process.
     """
 
     discrepancy: Discrepancy
     canonical: Float[np.ndarray, "v 3"]
+    variance: Float[np.ndarray, "v"]
     reach: Float[np.ndarray, "v"]
 
 
@@ -39,7 +41,7 @@ class SurfaceSpread:
         """SD of each vertex (mm)."""
         variance = np.square(self.factors).sum(axis=1)
         if self.local is not None:
-            variance = variance + np.square(self.local.reach) * self.local.discrepancy.variance(self.local.canonical)
+            variance = variance + np.square(self.local.reach) * self.local.variance
         return np.asarray(np.sqrt(variance))
 
     def sd_of(self, slope: Float[np.ndarray, "v"]) -> float:

@@ -19,6 +19,7 @@ from model.inference.member_moves import member_moves
 from model.inference.mesh import Mesh, area_cm2, area_gradient, vertex_areas, volume_ml
 from model.inference.posterior import (
     FieldDerivatives,
+    field_derivatives,
     fitted_jacobians,
     fitted_logits,
     logit_variance,
@@ -64,13 +65,9 @@ def surface_spread(
     """
     found = state.fits[0]
     if state.covariance is not None:
-        _, by_parameter, by_point = fitted_jacobians(model, found, mesh.vertices, known)
-        scale, offset = calibrated_scale(model)
-        size = len(state.covariance)
-        factors = np.full((len(mesh.vertices), size + 1), offset)
-        spread = scale * np.linalg.cholesky(state.covariance)
-        np.matmul(normal_displacements(by_parameter, by_point), spread, out=factors[:, :size])
-        return SurfaceSpread(factors, _local_spread(found, mesh, by_point, scale))
+        canonical = found.pose.to_canonical(mesh.vertices)
+        known = field_derivatives(model, found, canonical) if known is None else known
+        return _laplace_spread(found, state.covariance, canonical, known, *calibrated_scale(model))
     if state.members:
         moves = member_moves(model, found, state.members, mesh, known)
         return SurfaceSpread((moves - moves.mean(axis=1, keepdims=True)) / np.sqrt(len(state.members) - 1))
@@ -93,11 +90,25 @@ def uncalibrated(model: ShapeModel, sd_mm: Float[np.ndarray, "v"]) -> Float[np.n
     return np.asarray(np.sqrt(np.maximum(np.square(sd_mm) - offset**2, 0.0)) / scale)
 
 
-def _local_spread(found: Fit, mesh: Mesh, by_point: Float[np.ndarray, "v 3"], scale: float) -> LocalSpread | None:
-    if found.discrepancy is None:
-        return None
-    reach = normal_displacements(np.full((len(by_point), 1), scale * found.discrepancy.slope), by_point)[:, 0]
-    return LocalSpread(found.discrepancy, found.pose.to_canonical(mesh.vertices), reach)
+def _laplace_spread(
+    found: Fit,
+    covariance: Float[np.ndarray, "p p"],
+    canonical: Float[np.ndarray, "v 3"],
+    known: FieldDerivatives,
+    scale: float,
+    offset_mm: float,
+) -> SurfaceSpread:
+    """Posterior at canonical points of the surface, see `calibrated_scale` for the last two."""
+    by_point, by_parameter, local = found.pose.gradient_to_world(known.by_point), known.by_parameter, None
+    if found.discrepancy is not None:
+        carried, variance = found.discrepancy.held(canonical)
+        by_parameter = by_parameter - found.discrepancy.slope * carried
+        reach = normal_displacements(np.full((len(by_point), 1), scale * found.discrepancy.slope), by_point)[:, 0]
+        local = LocalSpread(found.discrepancy, canonical, variance, reach)
+    factors = np.full((len(canonical), len(covariance) + 1), offset_mm)
+    roots = scale * np.linalg.cholesky(covariance)
+    np.matmul(normal_displacements(by_parameter, by_point), roots, out=factors[:, :-1])
+    return SurfaceSpread(factors, local)
 
 
 def volume_estimate(mesh: Mesh, spread: SurfaceSpread | None) -> Estimate:

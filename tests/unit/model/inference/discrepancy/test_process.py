@@ -135,11 +135,15 @@ def test_variance_by_the_nearest_contours_is_nearly_that_by_all():
     points = on_a_cylinder(around.ravel(), slices.ravel())
     places = on_a_cylinder(RANDOM.uniform(0, 2 * np.pi, 300), RANDOM.uniform(-22.0, 22.0, 300))
     assert len(points) > 3 * NEAREST
-    process = replace(PROCESS, points=points, residuals=np.zeros(len(points)), jacobian=np.zeros((len(points), 4)))
+    moves = np.column_stack([np.ones(len(points)), points / 10.0])
+    process = replace(PROCESS, points=points, residuals=np.zeros(len(points)), jacobian=moves)
     cross = written_out(places, points)
     gram = written_out(points, points) + 0.2**2 * np.eye(len(points))
     exact = COVARIANCE.variance - np.einsum("mn,nm->m", cross, np.linalg.solve(gram, cross.T))
     np.testing.assert_allclose(np.sqrt(process.variance(places)), np.sqrt(exact), rtol=0.02)
+    carried, variance = process.held(places)
+    np.testing.assert_array_equal(variance, process.variance(places))
+    assert np.abs(carried - process.carried(places)).max() < 0.05 * np.abs(carried).max()
 
 
 def test_quadratic_form_is_the_variance_of_a_sum():
