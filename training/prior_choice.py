@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from model.bundle import ShapeModel
 from model.errors import InvalidParameter
 from training.calibration import PRECISIONS, wrong_share
 from training.cohorts.cohort import Case
@@ -73,14 +74,15 @@ def chosen_parts(
     _check_unseen(run, cases)
     used = cases[:: -(-len(cases) // CASES)]
 
-    def errors(candidate: PriorParts | None, precision: float) -> Float[np.ndarray, "n"]:
-        found = _errors(run, candidate, precision, used, regimes)
+    def errors(model: ShapeModel, precision: float) -> Float[np.ndarray, "n"]:
+        found = _errors(model, precision, used, regimes)
         watch()
         return found
 
-    trained = {precision: errors(None, precision) for precision in PRECISIONS}
+    as_trained = trial_model(run, None)
+    trained = {precision: errors(as_trained, precision) for precision in PRECISIONS}
     best = min(trained, key=lambda precision: float(trained[precision].mean()))
-    return choice_by(trained[best], lambda candidate: errors(candidate, best), parts)
+    return choice_by(trained[best], lambda candidate: errors(trial_model(run, candidate), best), parts)
 
 
 def _check_unseen(run: Path, cases: Sequence[Case]) -> None:
@@ -97,7 +99,7 @@ def _check_unseen(run: Path, cases: Sequence[Case]) -> None:
 def choice_by(
     trained: Float[np.ndarray, "n"], errors: Callable[[PriorParts], Float[np.ndarray, "n"]], parts: PriorParts
 ) -> Choice:
-    """The choice given each case's error with the model as it was trained, and with some parts."""
+    """The choice given each case's error (share of wrong voxels) with the trained model and with some parts."""
     *fitted, as_trained = _by_fitness(parts)
     for candidate in fitted:
         found = errors(candidate)
@@ -123,9 +125,8 @@ def _by_fitness(parts: PriorParts) -> Iterator[PriorParts]:
 
 
 def _errors(
-    run: Path, parts: PriorParts | None, precision: float, cases: Sequence[Case], regimes: Sequence[Regime]
+    model: ShapeModel, precision: float, cases: Sequence[Case], regimes: Sequence[Regime]
 ) -> Float[np.ndarray, "n"]:
-    """Share of wrong voxels of each case, mean over its drawings."""
-    model = trial_model(run, parts)
+    """Share of wrong voxels of each case at a likelihood precision (1/mm^2), mean over its drawings."""
     model = replace(model, manifest=replace(model.manifest, likelihood_precision=precision))
     return np.array([np.mean([wrong_share(model, case, regime) for regime in regimes]) for case in cases])

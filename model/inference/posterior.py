@@ -89,18 +89,15 @@ def _derivatives(model: ShapeModel, fit: Fit, canonical: Float[np.ndarray, "n 3"
     by_parameter = np.concatenate([by_latent, fit.pose.jacobian(canonical, by_point)], axis=1)
     if fit.discrepancy is None:
         return FieldDerivatives(logits, by_parameter, by_point)
-    share, slope = fit.discrepancy.shrinkage(logits)[:, None], fit.discrepancy.slope
-    mean, gradient = fit.discrepancy.mean_and_gradient(canonical)
-    return FieldDerivatives(
-        fit.discrepancy.levels(logits) + slope * mean, share * by_parameter, share * by_point + slope * gradient
-    )
+    field, gradient = fit.discrepancy.corrected_with_gradient(logits, by_point, canonical)
+    return FieldDerivatives(field, fit.discrepancy.shrinkage(logits)[:, None] * by_parameter, gradient)
 
 
 def _held(
     fit: Fit, canonical: Float[np.ndarray, "n 3"], by_parameter: Float[np.ndarray, "n p"]
 ) -> Float[np.ndarray, "n p"]:
     """Derivatives of the field that the contours hold: around them the discrepancy gives way to a parameter."""
-    if fit.discrepancy is None or not len(canonical):
+    if fit.discrepancy is None:
         return by_parameter
     return np.asarray(by_parameter - fit.discrepancy.slope * fit.discrepancy.carried(canonical))
 

@@ -47,9 +47,7 @@ class SurfaceSpread:
     def sd_of(self, slope: Float[np.ndarray, "v"]) -> float:
         """SD of a figure that changes by ``slope_v`` for a mm of outward movement of vertex v."""
         moved = np.flatnonzero(slope)
-        few = 2 * moved.size < slope.size
-        by_factor = slope[moved] @ self.factors[moved] if few else slope @ self.factors
-        variance = float(np.square(by_factor).sum())
+        variance = float(np.square(slope @ self.factors).sum())
         if self.local is not None and moved.size:
             reach = slope[moved] * self.local.reach[moved]
             variance += self.local.discrepancy.functional_variance(self.local.canonical[moved], reach)

@@ -41,9 +41,7 @@ def surface_of(
         logits, by_point = (part[0] for part in model.decoder.logits_and_gradients(latent[None], points[None]))
         if discrepancy is None:
             return logits, by_point
-        mean, slopes = discrepancy.mean_and_gradient(points)
-        held = discrepancy.shrinkage(logits)[:, None] * by_point + discrepancy.slope * slopes
-        return discrepancy.levels(logits) + discrepancy.slope * mean, held
+        return discrepancy.corrected_with_gradient(logits, by_point, points)
 
     return _extracted(model, latent, pose, step_mm, discrepancy, gradient, keep_specks=keep_specks)
 

@@ -31,7 +31,7 @@ LATTICE_STEPS = 1.75
 DIFFERENCE_MM = 0.02
 #: Size of the cells whose points are taken together in a functional, in shortest lengths.
 GROUP_SHARE = 0.8
-#: Contour points that tell the variance at a point.
+#: Contour points that tell the variance at a point, and how far they hold it.
 NEAREST = 64
 #: Size of the cells whose points have these in common, in shortest lengths.
 PATCH_SHARE = 3.0
@@ -71,6 +71,14 @@ class Discrepancy:
         """``g m``."""
         scale = REACH_MM * self.slope
         return np.asarray(scale * np.tanh(logits / scale))
+
+    def corrected_with_gradient(
+        self, logits: Float[np.ndarray, "m"], by_point: Float[np.ndarray, "m 3"], canonical: Float[np.ndarray, "m 3"]
+    ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 3"]]:
+        """``F`` and its gradient (1/mm) where the decoder gives these logits and derivatives by canonical point."""
+        mean, slopes = self.mean_and_gradient(canonical)
+        gradient = self.shrinkage(logits)[:, None] * by_point + self.slope * slopes
+        return self.levels(logits) + self.slope * mean, gradient
 
     def shrinkage(self, logits: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
         """Derivative of ``g m`` by the logit."""
