@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from model.geometry import POSE_SIZE
 from model.inference.fit_types import FitOptions, FitStatus
@@ -94,8 +94,13 @@ def descend(
 
 
 def damped_step(point: Point, damping: float) -> Float[np.ndarray, "p"]:
-    """Solution of the damped normal equations, shortened so that the object moves and turns by a bounded step."""
-    damped = point.curvature + damping * np.diag(np.diag(point.curvature))
+    """Solution of the damped normal equations, shortened so that the object moves and turns by a bounded step.
+
+    The code is damped by its whole curvature, the pose by the diagonal of its own (Marquardt 1963): the same model in
+    other latent coordinates takes the same way.
+    """
+    of_code, of_pose = point.curvature[:-POSE_SIZE, :-POSE_SIZE], np.diag(point.curvature)[-POSE_SIZE:]
+    damped = point.curvature + damping * block_diag(of_code, np.diag(of_pose))
     step = -cho_solve(cho_factor(damped), point.gradient)
     excess = max(
         np.linalg.norm(step[:-POSE_SIZE] / point.reach) / LONGEST_CODE_STEP,
