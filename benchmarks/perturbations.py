@@ -4,6 +4,7 @@ For each case and perturbation: average surface distance against the dense mask,
 drawing, and whether the answer says that it is not reliable.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,7 @@ from training.perturb import (
     one_end,
     parallel,
     sections_of,
+    tilted,
     with_wrong,
 )
 from training.sparsify import for_evaluation
@@ -41,6 +43,7 @@ from training.sparsify import for_evaluation
 DATA = Path("../shared/data")
 OFFSET_MM = (20.0, -20.0, 20.0)
 TURN_DEGREES = 20.0
+TILTS_DEGREES = (15.0, 30.0, 45.0)
 #: A perturbation is borne when the mean distance stays within this factor.
 BORNE = 1.05
 
@@ -92,6 +95,9 @@ def perturbations() -> Iterator[Perturbation]:
     yield Perturbation("planes end inside the object", five, lambda s: cut_off(five(s)), here)
     yield Perturbation("planes end inside, orthogonal", orthogonal, lambda s: cut_off(orthogonal(s)), here)
     yield Perturbation("thick slices", _regime("thin"), _regime("thick"), here)
+    for degrees in TILTS_DEGREES:
+        tilt = functools.partial(_tilted, degrees=degrees)
+        yield Perturbation(f"slices leaning by {degrees:g} degrees", five, tilt, here)
     yield Perturbation("five oblique planes", five, lambda s: oblique(s.case, 5), here)
     yield Perturbation("one end only", five, lambda s: one_end(s.case.mask, s.case.grid), here)
     for kind in WRONG_KINDS:
@@ -106,6 +112,10 @@ def perturbations() -> Iterator[Perturbation]:
 def five(scene: Scene) -> Sections:
     """Five parallel slices."""
     return parallel(scene.case.mask, scene.case.grid)
+
+
+def _tilted(scene: Scene, degrees: float) -> Sections:
+    return tilted(scene.case, degrees)
 
 
 def orthogonal(scene: Scene) -> Sections:

@@ -11,11 +11,12 @@ from typing import Literal, assert_never
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt, gaussian_filter, shift
+from scipy.spatial.transform import Rotation
 
 from model.geometry import Grid
 from model.inference.mask_stack import MaskStack, Plane, section_of
 from training.cohorts.cohort import Case
-from training.oblique import random_planes
+from training.oblique import random_planes, section
 from training.sparsify import Drawing, body_axes
 
 WrongKind = Literal["shifted", "another case", "mirrored", "dilated", "misplaced"]
@@ -106,6 +107,18 @@ def one_end(mask: Bool[np.ndarray, "i j k"], grid: Grid, every: int = 3) -> Sect
 def oblique(case: Case, count: int, seed: int = 0) -> Sections:
     """Random planes in any orientation, each a series of its own."""
     return Sections(random_planes(case, count, seed).stacks, (2,) * count)
+
+
+def tilted(case: Case, degrees: float, count: int = 5) -> Sections:
+    """Parallel slices as of `parallel` whose normal leans by an angle."""
+    axis, _, _ = _longest(case.mask, case.grid)
+    along = case.grid.affine[:3, axis] / case.grid.spacing[axis]
+    about = case.grid.affine[:3, (axis + 1) % 3]
+    normal = Rotation.from_rotvec(np.radians(degrees) * about / np.linalg.norm(about)).apply(along)
+    reach = case.grid.to_world(np.argwhere(case.mask).astype(float)) @ normal
+    places = reach.min() + (np.arange(count) + 0.5) * np.ptp(reach) / count
+    stacks = tuple(section(case, normal, float(place), f"mask[{n}]") for n, place in enumerate(places))
+    return Sections(stacks, (2,) * count)
 
 
 def noisy(

@@ -27,6 +27,7 @@ from training.perturb import (
     one_end,
     parallel,
     sections_of,
+    tilted,
     with_wrong,
 )
 from training.sparsify import for_evaluation
@@ -131,6 +132,16 @@ def test_disturbed_drawings_are_fitted_nearly_as_well(sections):
 def test_oblique_planes_are_fitted(seed):
     drawn = oblique(Case("one", "one", "validation", MASK, GRID), 6, seed)
     assert accuracy(drawn) > accuracy(FIVE) - 0.03
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 40.0])
+def test_leaning_slices_are_fitted_as_well(degrees):
+    drawn = tilted(Case("one", "one", "validation", MASK, GRID), degrees)
+    normals = np.array([stack.grid.affine[:3, 2] / stack.grid.spacing[2] for stack in drawn.stacks])
+    leaning = np.degrees(np.arccos(np.abs(normals[:, FIVE.axes[0]])))
+    np.testing.assert_allclose(leaning, degrees, atol=1e-4)
+    assert all(stack.foreground.any() for stack in drawn.stacks)
+    assert accuracy(drawn) > accuracy(FIVE) - 0.02
 
 
 @pytest.mark.parametrize(
