@@ -132,6 +132,28 @@ def calibrate_bundle(
     return found
 
 
+def calibrate_bundle_as(folder: Path, known: Manifest, cohort: Cohort, *, threads: int | None = None) -> None:
+    """Let a bundle trust drawings as much as another calibrated one does; how its own answers look is found out anew.
+
+    For models of one training that differ in their prior: which precision and fidelity come out best is often chance,
+    and would stand for a difference between the priors.
+
+    Args:
+        known: of the other bundle.
+
+    Raises:
+        BundleError: the bundle cannot be trusted.
+    """
+    model = open_bundle(folder, threads=threads)
+    changed = replace(
+        model.manifest,
+        likelihood_precision=known.likelihood_precision,
+        discrepancy=known.discrepancy,
+        calibration=known.calibration,
+    )
+    write_manifest(with_sound_drawings(replace(model, manifest=changed), cohort.validation), folder)
+
+
 def with_sound_drawings(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda precision: None) -> Manifest:
     """The manifest with what answers to sound drawings of validation cases show: usual, typical, width of SDs."""
     chosen = cases[:: -(-len(cases) // JUDGED_CASES)]

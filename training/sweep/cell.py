@@ -3,7 +3,7 @@
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from model.bundle import Manifest, ShapeModel, open_bundle, read_manifest
 from model.errors import InvalidParameter
-from training.calibration import calibrate_bundle
+from training.calibration import calibrate_bundle, calibrate_bundle_as
 from training.choices import (
     DeviceName,
     ObjectiveName,
@@ -64,20 +64,35 @@ class Effort:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the parts of a cell lie: its training's run, which other cells may share, and its bundle."""
+    """Where the parts of a cell lie.
+
+    Attributes:
+        run: its training's, which other cells may share.
+        bundle: its own.
+        plain: the bundle of the cell of that training that keeps the prior as it was trained; itself, of such a cell.
+    """
 
     run: Path
     bundle: Path
+    plain: Path
 
     @classmethod
     def of(cls, sweep_folder: Path, cell: Cell) -> "Place":
         """Of a cell in a sweep's folder."""
-        return cls(sweep_folder / TRAININGS / cell.training_key / "run", sweep_folder / CELLS / cell.key / "bundle")
+        plain = cell if cell.together else replace(cell, prior=PriorName.PLAIN)
+        cells = sweep_folder / CELLS
+        run = sweep_folder / TRAININGS / cell.training_key / "run"
+        return cls(run, cells / cell.key / "bundle", cells / plain.key / "bundle")
 
     @property
     def is_exported(self) -> bool:
         """Whether the bundle is there."""
-        return (self.bundle / "manifest.json").is_file()
+        return is_exported(self.bundle)
+
+
+def is_exported(bundle: Path) -> bool:
+    """Whether a bundle is there."""
+    return (bundle / "manifest.json").is_file()
 
 
 def run_cell(
@@ -204,8 +219,16 @@ def _export(place: Place, cohort: Cohort, effort: Effort, parts: PriorParts | No
     shutil.rmtree(part, ignore_errors=True)
     export_run(place.run, part, parts=parts)
     if effort.calibrate and cohort.validation:
-        calibrate_bundle(part, cohort, threads=1)
+        _calibrate(part, place, cohort)
     part.rename(place.bundle)
+
+
+def _calibrate(part: Path, place: Place, cohort: Cohort) -> None:
+    """As the plain cell of the training was, where it is there: what differs between the two is the prior's then."""
+    if place.plain != place.bundle and is_exported(place.plain):
+        calibrate_bundle_as(part, read_manifest(place.plain)[0], cohort, threads=1)
+    else:
+        calibrate_bundle(part, cohort, threads=1)
 
 
 def _measured(

@@ -56,8 +56,9 @@ def cells_of(
     seeds: Iterable[int],
     objective: str,
 ) -> list[Cell]:
-    """Every combination once, small latent sizes first."""
-    found = itertools.product(sorted(set(latent_sizes)), regimes, priors, seeds)
+    """Every combination once, small latent sizes first, and of a training the plain cell, which the others look at."""
+    plain_first = sorted(priors, key=lambda prior: prior is not PriorName.PLAIN)
+    found = itertools.product(sorted(set(latent_sizes)), regimes, plain_first, seeds)
     return list(dict.fromkeys(Cell(regime, size, prior, seed, objective) for size, regime, prior, seed in found))
 
 

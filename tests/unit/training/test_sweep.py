@@ -16,7 +16,7 @@ import torch
 import typer
 from typer.testing import CliRunner
 
-from model.bundle import read_manifest
+from model.bundle import read_manifest, write_manifest
 from model.errors import InvalidParameter
 from training.choices import DeviceName
 from training.cli import register
@@ -78,9 +78,10 @@ def call(*words):
 
 class TestPlan:
     def test_every_combination_stands_once(self):
-        cells = cells_of([32, 16, 16], ["thin", "thick"], [PriorName.PLAIN, PriorName.FLOW_ARD], range(3), "paper")
+        cells = cells_of([32, 16, 16], ["thin", "thick"], [PriorName.FLOW_ARD, PriorName.PLAIN], range(3), "paper")
         assert len(cells) == len({cell.key for cell in cells}) == 2 * 2 * 2 * 3
         assert [cell.latent_size for cell in cells] == 12 * [16] + 12 * [32]
+        assert [cell.prior for cell in cells[:6]] == 3 * [PriorName.PLAIN] + 3 * [PriorName.FLOW_ARD]
 
     def test_dense_cells_are_measured_in_every_sparse_regime(self):
         assert Cell("dense", 8, PriorName.ARD).measured_in == ("thin", "thick", "orthogonal")
@@ -218,6 +219,24 @@ class TestSweep:
         assert answer.exit_code == 0, answer.output
         (one,) = read_results(tmp_path)
         assert (one.prior, checkpoint.stat().st_mtime_ns) == (prior, before)
+
+    def test_cells_of_a_training_trust_drawings_as_its_plain_one_does(self, swept, tmp_path):
+        folder, words, _ = swept
+        shutil.copytree(folder, tmp_path / "again")
+        (fitted,) = (tmp_path / "again" / "cells").glob("*-flow-ard-*")
+        (plain,) = (tmp_path / "again" / "cells").glob("*-plain-*/bundle")
+        shutil.rmtree(fitted)
+        kept = [one for one in read_results(folder) if one.prior == "plain"]
+        (tmp_path / "again" / "results.jsonl").unlink()
+        append(tmp_path / "again", *kept)
+        known = {"spread_mm": 0.77, "fidelity": 0.42}
+        write_manifest(replace(read_manifest(plain)[0], likelihood_precision=0.37, discrepancy=known), plain)
+        answer = call(*[word for word in words[:-4] if word != "--no-calibrate"], tmp_path / "again", "--jobs", 1)
+        assert answer.exit_code == 0, answer.output
+        found = read_manifest(fitted / "bundle")[0]
+        assert (found.likelihood_precision, found.discrepancy) == (0.37, known)
+        assert found.calibration["sound_cases"] == 1
+        assert found.usual
 
     def test_the_report_is_one_file_with_tables_and_panels(self, swept, tmp_path):
         folder, _, _ = swept
