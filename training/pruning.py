@@ -7,7 +7,8 @@ their mean. The flow is autoregressive: dead dimensions enter the conditioners o
 after transform. Between transforms a dead dimension may follow live ones a little; `Pruned.base_change` measures what
 that alters.
 
-`refitted` goes on with codes that are Gaussians. It turns them to the principal movements of the surface
+`refitted` goes on with codes that are Gaussians, and with all of their dimensions: one that says little of the training
+shapes may still be what another shape needs. It turns them to the principal movements of the surface
 (`training.principal`) and determines relevance there in closed form: with the decoder given, the evidence is largest
 where a sigma is the root mean square of its coordinate over the posteriors of all codes (MacKay 1995; Bishop 1999 for
 principal components), here of their shrunk covariance (`training.shrinkage`). Coordinates that then move next to
@@ -98,13 +99,12 @@ class Pruned:
 
     def rule(self) -> str:
         """By what dimensions were kept, in words."""
-        if self.fitted is not None and not self.fitted.ard:
-            return "all"
+        if self.fitted is not None:
+            moving = f"movement at least {self.fitted.least_movement:g} of the largest"
+            return moving if self.fitted.ard and self.fitted.least_movement > 0.0 else "all"
         if np.isnan(self.nats).any():
             return f"standard deviation of the codes at least {LEAST_SHARE:g} of the largest"
-        trained = f"sigma at least {LEAST_SHARE:g} of the largest and divergence at least {LEAST_NATS:g} nats a shape"
-        moving = "" if self.fitted is None else f"; movement at least {self.fitted.least_movement:g} of the largest"
-        return f"{trained}{moving}"
+        return f"sigma at least {LEAST_SHARE:g} of the largest and divergence at least {LEAST_NATS:g} nats a shape"
 
 
 @torch.no_grad()
@@ -139,7 +139,7 @@ def refitted(
         parts: what is fitted; all when None.
     """
     parts = PriorParts() if parts is None else parts
-    less = pruned(module, keep_all=module.random and not parts.ard)
+    less = pruned(module, keep_all=module.random)
     if not module.random:
         return less
     codes, target = live_codes(module, less, shapes)

@@ -40,13 +40,13 @@ class SparseLattice:
         """Values of nodes; NaN where none was set, and outside the grid."""
         return np.asarray(self._values[self._address(self._keys(nodes, (0,), (0,), (0,)))].reshape(-1))
 
-    def around(self, cells: Nodes, *offsets: Sequence[int]) -> Float[np.ndarray, "_ i j k"]:
+    def around(self, cells: Nodes, *offsets: Sequence[int]) -> Float[np.ndarray, "i j k _"]:
         """Values at nodes of some offsets along each axis from each cell's first corner."""
         return np.asarray(self._values[self._address(self._keys(cells, *offsets))])
 
-    def corner_values(self, cells: Nodes) -> Float[np.ndarray, "_ 8"]:
+    def corner_values(self, cells: Nodes) -> Float[np.ndarray, "8 _"]:
         """Values at the corners of cells, in the order of `CORNERS`."""
-        return self.around(cells, _PAIR, _PAIR, _PAIR).reshape(-1, 8)
+        return self.around(cells, _PAIR, _PAIR, _PAIR).reshape(8, -1)
 
     def put(self, nodes: Nodes, values: Float[np.ndarray, "_"]) -> None:
         """Set values."""
@@ -75,11 +75,14 @@ class SparseLattice:
         return self._nodes(np.flatnonzero(mark))
 
     def _keys(self, cells: Nodes, *offsets: Sequence[int]) -> Addresses:
-        """Brick of the whole grid, and place in the brick, of each offset node in one number."""
+        """Brick of the whole grid, and place in the brick, of each offset node in one number.
+
+        The cells come last, for sums over a long last axis are several times as fast.
+        """
         key: Addresses = np.zeros(1, np.int64)
         for axis, offset in enumerate(offsets):
-            shape = [-1 if other == axis else 1 for other in range(3)]
-            nodes = cells[:, axis].reshape(-1, 1, 1, 1) + np.asarray(offset, np.int64).reshape(shape)
+            shape = [-1 if other == axis else 1 for other in range(4)]
+            nodes = cells[:, axis] + np.asarray(offset, np.int64).reshape(shape)
             stride = int(np.prod(self._bricks[axis + 1 :])) << 3 * BITS
             key = key + (((nodes >> BITS) + 1) * stride + ((nodes & _REST) << (2 - axis) * BITS))
         return key

@@ -106,7 +106,7 @@ class Refinement:
         values = self._lattice.corner_values(cells)
         outer = self._outer(cells)
         mixed = _mixed(values)
-        return np.concatenate([cells[mixed], outer]), np.concatenate([values[mixed], self._padded(outer)])
+        return np.concatenate([cells[mixed], outer]), np.concatenate([values[:, mixed].T, self._padded(outer)])
 
     def beyond_ends(self, starts: Nodes, axes: Int[np.ndarray, "v"]) -> Float[np.ndarray, "v 2"]:
         """Values at the nodes of the finest grid before and behind edges on their own lines; NaN where unknown.
@@ -159,7 +159,7 @@ class Refinement:
         cells = self._lattice.cells()
         values = self._lattice.corner_values(cells)
         error = self._errors(cells)
-        eighths = (_HALVES.reshape(64, 8) @ values.T).reshape(8, 8, -1)
+        eighths = (_HALVES.reshape(64, 8) @ values).reshape(8, 8, -1)
         outside, inside = eighths.min(axis=1) <= error, eighths.max(axis=1) >= -error
         self._stride //= 2
         kept = [self._children(cells, k, outside[k] & inside[k], inside[k]) for k in range(8)]
@@ -196,10 +196,9 @@ class Refinement:
     def _bend(self, cells: Nodes, axis: int) -> Float[np.ndarray, "n"]:
         """Largest second difference along an axis at the corners; infinite where no neighbour is known."""
         offsets = [(-1, 0, 1, 2) if other == axis else (0, 1) for other in range(3)]
-        values = np.moveaxis(self._lattice.around(cells, *offsets), axis + 1, 0).reshape(4, len(cells), 4)
+        values = np.moveaxis(self._lattice.around(cells, *offsets), axis, 0)
         bends = np.abs(values[:2] - 2.0 * values[1:3] + values[2:])
-        largest = np.fmax(bends[0], bends[1])
-        largest = np.fmax(np.fmax(largest[:, 0], largest[:, 1]), np.fmax(largest[:, 2], largest[:, 3]))
+        largest = np.fmax.reduce(bends.reshape(8, -1))
         return np.asarray(np.where(np.isnan(largest), np.float32(np.inf), largest))
 
     def _outer(self, cells: Nodes) -> Nodes:
@@ -219,12 +218,12 @@ class Refinement:
         return np.where(outside, -np.abs(values), values).reshape(-1, 8)
 
 
-def _signs(values: Float[np.ndarray, "n 8"]) -> UInt8[np.ndarray, "n"]:
+def _signs(values: Float[np.ndarray, "8 n"]) -> UInt8[np.ndarray, "n"]:
     """Positive corners as bits."""
-    return np.packbits(values > 0, axis=1)[:, 0]
+    return np.asarray(np.packbits(values > 0, axis=0)[0])
 
 
-def _mixed(values: Float[np.ndarray, "n 8"]) -> Bool[np.ndarray, "n"]:
+def _mixed(values: Float[np.ndarray, "8 n"]) -> Bool[np.ndarray, "n"]:
     signs = _signs(values)
     return np.asarray((signs > 0) & (signs < 255))
 

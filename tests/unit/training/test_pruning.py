@@ -173,14 +173,28 @@ class TestRefitted:
         assert found.facts()["rule"] == "all"
 
     def test_with_relevance_only_what_moves_the_surface_stays(self):
-        found = refitted(module_of(), SHAPES, HALF_MM)
-        assert found.live.tolist() == LIVE
+        module = module_of(ard=False)
+        with torch.no_grad():
+            for part in (module.prior.log_sigma, module.log_deviation):
+                part[..., [1, 4]] = -9.0
+            module.mean[:, [1, 4]] *= 1e-4
+        found = refitted(module, SHAPES, HALF_MM)
         sigma = found.prior.sigma
-        assert len(sigma) <= len(LIVE)
+        assert len(sigma) == len(LIVE)
         assert float(sigma.min()) >= LEAST_MOVEMENT * float(sigma.max())
-        fewer = refitted(module_of(), SHAPES, HALF_MM, PriorParts(least_movement=float(sigma[1] / sigma[0]) - 1e-3))
+        fewer = refitted(module, SHAPES, HALF_MM, PriorParts(least_movement=float(sigma[1] / sigma[0]) - 1e-3))
         torch.testing.assert_close(fewer.prior.sigma, sigma[:2])
         assert f"{fewer.fitted.least_movement:g} of the largest" in fewer.facts()["rule"]
+
+    def test_all_of_the_prior_and_all_dimensions_are_the_trained_model(self):
+        """What a run says nothing of along a dimension may still be what another shape needs."""
+        module = module_of(ard=False)
+        found = refitted(module, SHAPES, HALF_MM, PriorParts(flow=False, least_movement=0.0, least_of_training=1.0))
+        assert found.facts()["rule"] == "all"
+        assert found.live.tolist() == list(range(SIZE))
+        turned = found.codes / found.prior.sigma
+        trained = (module.code_means() - module.code_means().mean(dim=0)) / module.prior.sigma
+        torch.testing.assert_close(turned @ turned.T, trained @ trained.T, atol=1e-3, rtol=1e-3)
 
     @pytest.mark.parametrize("flow", [True, False])
     def test_a_flow_is_there_when_it_is_asked_for(self, flow):
