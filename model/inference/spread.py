@@ -1,11 +1,12 @@
 """Posterior of the surface's movement along its normal, to first order."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
-from model.inference.discrepancy.process import Discrepancy
+from model.inference.discrepancy.process import FEW, Discrepancy, GroupedPoints
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,17 @@ class LocalSpread:
     canonical: Float[np.ndarray, "v 3"]
     variance: Float[np.ndarray, "v"]
     reach: Float[np.ndarray, "v"]
+
+    def variance_of(self, slope: Float[np.ndarray, "v"]) -> float:
+        """Variance of a figure that changes by ``slope_v`` for a mm of outward movement of vertex v."""
+        moved = np.flatnonzero(slope)
+        if len(moved) <= FEW:
+            return self.discrepancy.functional_variance(self.canonical[moved], slope[moved] * self.reach[moved])
+        return self.discrepancy.functional_variance(self.canonical, slope * self.reach, self._grouped)
+
+    @cached_property
+    def _grouped(self) -> GroupedPoints:
+        return self.discrepancy.grouped(self.canonical)
 
 
 @dataclass(frozen=True)
@@ -46,9 +58,5 @@ class SurfaceSpread:
 
     def sd_of(self, slope: Float[np.ndarray, "v"]) -> float:
         """SD of a figure that changes by ``slope_v`` for a mm of outward movement of vertex v."""
-        moved = np.flatnonzero(slope)
-        variance = float(np.square(slope @ self.factors).sum())
-        if self.local is not None and moved.size:
-            reach = slope[moved] * self.local.reach[moved]
-            variance += self.local.discrepancy.functional_variance(self.local.canonical[moved], reach)
-        return float(np.sqrt(variance))
+        variance = float(np.square(slope.astype(self.factors.dtype) @ self.factors).sum())
+        return float(np.sqrt(variance if self.local is None else variance + self.local.variance_of(slope)))

@@ -99,15 +99,18 @@ def _laplace_spread(
     offset_mm: float,
 ) -> SurfaceSpread:
     """Posterior at canonical points of the surface, see `calibrated_scale` for the last two."""
-    by_point, by_parameter, local = found.pose.gradient_to_world(known.by_point), known.by_parameter, None
+    by_point = found.pose.gradient_to_world(known.by_point).astype(np.float32)
+    by_parameter, local = known.by_parameter, None
     if found.discrepancy is not None:
         carried, variance = found.discrepancy.held(canonical)
         by_parameter = by_parameter - found.discrepancy.slope * carried
-        reach = normal_displacements(np.full((len(by_point), 1), scale * found.discrepancy.slope), by_point)[:, 0]
+        reach = normal_displacements(
+            np.full((len(by_point), 1), scale * found.discrepancy.slope, np.float32), by_point
+        )[:, 0]
         local = LocalSpread(found.discrepancy, canonical, variance, reach)
-    factors = np.full((len(canonical), len(covariance) + 1), offset_mm)
-    roots = scale * np.linalg.cholesky(covariance)
-    np.matmul(normal_displacements(by_parameter, by_point), roots, out=factors[:, :-1])
+    factors = np.full((len(canonical), len(covariance) + 1), offset_mm, np.float32)
+    roots = (scale * np.linalg.cholesky(covariance)).astype(np.float32)
+    np.matmul(normal_displacements(by_parameter.astype(np.float32), by_point), roots, out=factors[:, :-1])
     return SurfaceSpread(factors, local)
 
 

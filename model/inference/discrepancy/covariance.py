@@ -9,7 +9,7 @@ Several lengths make one process that is both locally rough and correlated far (
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 #: Covariances computed at a time: few enough to stay in a core's cache.
 BLOCK = 1 << 16
@@ -48,14 +48,31 @@ class Covariance:
         result = np.empty((len(a), len(b)), np.float32)
         step = max(1, BLOCK // max(len(b), 1))
         for start in range(0, len(a), step):
-            self._fill(result[start : start + step], first[start : start + step], second)
+            piece = first[start : start + step]
+            squared = piece @ (-2.0 * second.T)
+            squared += np.square(piece).sum(axis=1)[:, None]
+            squared += np.square(second).sum(axis=1)
+            self._fill(result[start : start + step], np.maximum(squared, 0.0, out=squared))
         return result
 
-    def _fill(self, result: Float[np.ndarray, "n m"], a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "m 3"]) -> None:
-        squared = a @ (-2.0 * b.T)
-        squared += np.square(a).sum(axis=1)[:, None]
-        squared += np.square(b).sum(axis=1)
-        np.maximum(squared, 0.0, out=squared)
+    def with_chosen(
+        self, a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "m 3"], chosen: Int[np.ndarray, "n k"]
+    ) -> Float[np.ndarray, "n k"]:
+        """Covariances of the process between each point and its own choice of others (mm^2), in single precision."""
+        centre = b.mean(axis=0)
+        first, second = (a - centre).astype(np.float32), np.ascontiguousarray((b - centre).T, np.float32)
+        result = np.empty(chosen.shape, np.float32)
+        step = max(1, BLOCK // max(chosen.shape[1], 1))
+        for start in range(0, len(a), step):
+            numbers, piece = chosen[start : start + step], first[start : start + step]
+            squared = np.square(second[0][numbers] - piece[:, :1])
+            for axis in (1, 2):
+                squared += np.square(second[axis][numbers] - piece[:, axis, None])
+            self._fill(result[start : start + step], squared)
+        return result
+
+    def _fill(self, result: Float[np.ndarray, "n m"], squared: Float[np.ndarray, "n m"]) -> None:
+        """Covariances at squared distances (mm^2)."""
         term = np.empty_like(squared)
         for number, (sd, length) in enumerate(zip(self.sds, self.lengths, strict=True)):
             np.multiply(squared, np.float32(-0.5 / length**2), out=term)
