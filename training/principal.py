@@ -53,8 +53,16 @@ def principal_axes(
     codes: Float[Tensor, "m k"],
     covariance: Float[Tensor, "k k"],
     half_extent_mm: Sequence[float],
+    centre: Float[Tensor, "k"] | None = None,
 ) -> PrincipalAxes:
-    """Axes of a population of codes, given its covariance and the box (mm) that holds the surfaces."""
+    """Axes of a population of codes.
+
+    Args:
+        codes: training codes, at whose surfaces movements are measured.
+        covariance: of the population.
+        half_extent_mm: half sides of the box that holds the surfaces.
+        centre: of the population; the mean of the codes when None.
+    """
     spread = torch.linalg.cholesky(covariance.double())
     squares, turn = torch.linalg.eigh(
         length_metric([found @ spread for found in movements(decoder, codes, half_extent_mm)])
@@ -63,7 +71,8 @@ def principal_axes(
     axes = torch.linalg.solve_triangular(spread.T, turn.flip(1), upper=True) * sigma
     largest = axes.abs().argmax(dim=0)
     axes = axes * axes.gather(0, largest[None]).sign()
-    return PrincipalAxes(codes.mean(dim=0), axes.float(), sigma.float())
+    middle = codes.mean(dim=0) if centre is None else centre
+    return PrincipalAxes(middle, axes.float(), sigma.float())
 
 
 @torch.no_grad()

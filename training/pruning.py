@@ -146,7 +146,9 @@ def refitted(
     least_share = 0.0 if module.config.prior.use_ard else parts.least_of_training
     covariance, share = shrunk_covariance(codes, target, least_share)
     with torch.no_grad():
-        axes = principal_axes(less.decoder, codes.mean, covariance, half_extent_mm)
+        # As the covariance is, the centre is between that of the codes and that of the training's prior, which is zero.
+        centre = (1.0 - share) * codes.mean.mean(dim=0)
+        axes = principal_axes(less.decoder, codes.mean, covariance, half_extent_mm, centre)
         least = parts.least_movement if parts.ard else 0.0
         moving = torch.arange(int((axes.sigma >= least * axes.sigma[0]).sum()))
         decoder = pruned_decoder(turned_decoder(less.decoder, axes), moving, torch.zeros(len(axes.sigma)))

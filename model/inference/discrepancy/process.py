@@ -149,7 +149,7 @@ class Discrepancy:
     def _neighbourhoods(
         self, canonical: Float[np.ndarray, "m 3"]
     ) -> Iterator[tuple[Int[np.ndarray, "r"], Int[np.ndarray, "k"], Float[np.ndarray, "r k"]]]:
-        """Points that lie close together, the contour points nearest to them, and their covariances (mm^2) with these."""
+        """Points that lie close together, the contour points nearest to them, and the covariances (mm^2) of both."""
         if len(self.points) <= NEAREST or not len(canonical):
             cross = self.covariance.between(canonical, self.points)
             yield np.arange(len(canonical)), np.arange(len(self.points)), cross
