@@ -135,6 +135,11 @@ class GraphSpec:
         scales = {name: extent_mm if name == "points" else self.units for name in self.inputs}
         return tuple(scales[n] * torch.randn(*sizes[n], generator=random).clamp(-2, 2) for n in self.inputs)
 
+    def traced_example(self, latent_size: int, extent_mm: float) -> tuple[Tensor, ...]:
+        """Inputs to trace with; numbers of codes and points differ from the code's size, or would be taken for it."""
+        batch, points = (7, 11) if latent_size not in (7, 11) else (13, 17)
+        return self.example(latent_size, extent_mm, batch, points, seed=0)
+
 
 def graph_specs(decoder: OccupancyDecoder, prior: LatentPrior) -> list[GraphSpec]:
     """All graphs of a bundle."""
@@ -189,14 +194,14 @@ def export_graphs(decoder: OccupancyDecoder, prior: LatentPrior, folder: Path) -
 
 def _flattened(spec: GraphSpec, size: int, extent: float) -> nn.Module:
     """The module as plain tensor operations with symbolic sizes, automatic differentiation included."""
-    example = spec.example(size, extent, batch=7, points=11, seed=0)
+    example = spec.traced_example(size, extent)
     return make_fx(spec.module, tracing_mode="symbolic", _allow_non_fake_inputs=True)(*example)
 
 
 def _onnx_bytes(spec: GraphSpec, flat: nn.Module, size: int, extent: float) -> bytes:
     batch, points = Dim("b", min=1, max=4096), Dim("n", min=1, max=1 << 24)
     shapes = [{0: batch, 1: points} if name == "points" else {0: batch} for name in spec.inputs]
-    example = spec.example(size, extent, batch=7, points=11, seed=0)
+    example = spec.traced_example(size, extent)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     program = torch.export.export(flat, example, dynamic_shapes=tuple(shapes))
     exported = torch.onnx.export(
@@ -208,7 +213,7 @@ def _onnx_bytes(spec: GraphSpec, flat: nn.Module, size: int, extent: float) -> b
 
 
 def _scripted(module: nn.Module, spec: GraphSpec, size: int, extent: float) -> torch.jit.ScriptModule:
-    example = spec.example(size, extent, batch=7, points=11, seed=0)
+    example = spec.traced_example(size, extent)
     traced: torch.jit.ScriptModule = torch.jit.trace(module, example, check_trace=False)
     return traced
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from model.errors import ParityError
-from model.networks.export import GraphSpec, check_parity, graph_specs
-from model.networks.prior import LatentPrior
+from model.networks.export import GraphSpec, check_parity, export_graphs, graph_specs
+from model.networks.flow import FlowShape
+from model.networks.prior import LatentPrior, PriorShape
 from tests.random_networks import DECODER, PRIOR, Exported, jacobian, random_decoder, random_prior
 
 pytestmark = [
@@ -105,6 +106,20 @@ def test_a_torchscript_graph_of_other_weights_is_refused(exported, tmp_path):
     (tmp_path / f"{spec.name}.pt").write_bytes((exported.folder / "prior_sampling_1.pt").read_bytes())
     with pytest.raises(ParityError, match="TorchScript"):
         check_parity(spec, tmp_path, 3, DECODER.extent_mm)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("size", [1, 7, 11, 13])
+def test_a_code_may_have_any_size(size, tmp_path):
+    """A number of codes or points that the graphs were traced with is not taken for the size of the code."""
+    decoder = random_decoder(replace(DECODER, latent_size=size))
+    flow = FlowShape(latent_size=size, transforms=1, bins=3, width=8)
+    files = export_graphs(decoder, random_prior(PriorShape(flow)), tmp_path)
+    assert "decoder_jacobians.onnx" in files
+    session = onnxruntime.InferenceSession(tmp_path / "decoder_jacobians.onnx")
+    latent, points = np.ones((2, size), np.float32), np.ones((2, 29, 3), np.float32)
+    by_latent = session.run(["by_latent"], {"latent": latent, "points": points})[0]
+    assert by_latent.shape == (2, 29, size)
 
 
 def test_without_a_flow_there_is_nothing_to_invert():
