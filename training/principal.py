@@ -53,7 +53,7 @@ def principal_axes(
     codes: Float[Tensor, "m k"],
     covariance: Float[Tensor, "k k"],
     half_extent_mm: Sequence[float],
-    centre: Float[Tensor, "k"] | None = None,
+    centre: Float[Tensor, "k"],
 ) -> PrincipalAxes:
     """Axes of a population of codes.
 
@@ -61,7 +61,7 @@ def principal_axes(
         codes: training codes, at whose surfaces movements are measured.
         covariance: of the population.
         half_extent_mm: half sides of the box that holds the surfaces.
-        centre: of the population; the mean of the codes when None.
+        centre: of the population.
     """
     spread = torch.linalg.cholesky(covariance.double())
     squares, turn = torch.linalg.eigh(
@@ -71,8 +71,7 @@ def principal_axes(
     axes = torch.linalg.solve_triangular(spread.T, turn.flip(1), upper=True) * sigma
     largest = axes.abs().argmax(dim=0)
     axes = axes * axes.gather(0, largest[None]).sign()
-    middle = codes.mean(dim=0) if centre is None else centre
-    return PrincipalAxes(middle, axes.float(), sigma.float())
+    return PrincipalAxes(centre, axes.float(), sigma.float())
 
 
 @torch.no_grad()

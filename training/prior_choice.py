@@ -121,7 +121,7 @@ def _by_fitness(parts: PriorParts) -> Iterator[PriorParts]:
     """The last one is the model as it was trained, in principal coordinates."""
     yield parts
     yield replace(parts, least_of_training=1.0)
-    yield replace(parts, least_of_training=1.0, least_movement=0.0)
+    yield replace(parts, least_of_training=1.0, least_movement=0.0, keep_centre=True)
 
 
 def _errors(

@@ -49,12 +49,14 @@ class PriorParts:
         ard: whether irrelevant dimensions are left out; all stay otherwise.
         least_movement: a dimension is irrelevant whose principal movement is below this share of the largest.
         least_of_training: a prior that stood still in the training keeps at least this share of the codes' covariance.
+        keep_centre: whether the centre stays where the prior of the training has it, or is that of the codes.
     """
 
     flow: bool = True
     ard: bool = True
     least_movement: float = LEAST_MOVEMENT
     least_of_training: float = LEAST_OF_TRAINING
+    keep_centre: bool = False
 
 
 @dataclass(frozen=True)
@@ -146,8 +148,7 @@ def refitted(
     least_share = 0.0 if module.config.prior.use_ard else parts.least_of_training
     covariance, share = shrunk_covariance(codes, target, least_share)
     with torch.no_grad():
-        # As the covariance is, the centre is between that of the codes and that of the training's prior, which is zero.
-        centre = (1.0 - share) * codes.mean.mean(dim=0)
+        centre = torch.zeros(codes.mean.shape[1]) if parts.keep_centre else codes.mean.mean(dim=0)
         axes = principal_axes(less.decoder, codes.mean, covariance, half_extent_mm, centre)
         least = parts.least_movement if parts.ard else 0.0
         moving = torch.arange(int((axes.sigma >= least * axes.sigma[0]).sum()))

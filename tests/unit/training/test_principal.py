@@ -32,7 +32,7 @@ def parts(request):
     codes = torch.randn(SHAPES, SIZE) @ torch.randn(SIZE, SIZE) * 0.4 + 0.2
     deviation = 0.1 + 0.1 * torch.rand(SHAPES, SIZE)
     covariance = torch.cov(codes.T, correction=0) + torch.diag(deviation.square().mean(dim=0))
-    return decoder, codes, covariance, principal_axes(decoder, codes, covariance, HALF_MM)
+    return decoder, codes, covariance, principal_axes(decoder, codes, covariance, HALF_MM, codes.mean(dim=0))
 
 
 @torch.no_grad()
@@ -112,5 +112,5 @@ def on_surface(decoder, code, points):
 
 def test_the_same_codes_give_the_same_axes(parts):
     decoder, codes, covariance, axes = parts
-    again = principal_axes(decoder, codes, covariance, HALF_MM)
+    again = principal_axes(decoder, codes, covariance, HALF_MM, codes.mean(dim=0))
     torch.testing.assert_close(again.axes, axes.axes, atol=1e-4, rtol=1e-3)

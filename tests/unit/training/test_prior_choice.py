@@ -8,7 +8,7 @@ from training.pruning import PriorParts
 
 PARTS = PriorParts(flow=False, least_movement=0.02, least_of_training=0.3)
 WIDE = PriorParts(flow=False, least_movement=0.02, least_of_training=1.0)
-WHOLE = PriorParts(flow=False, least_movement=0.0, least_of_training=1.0)
+WHOLE = PriorParts(flow=False, least_movement=0.0, least_of_training=1.0, keep_centre=True)
 TRAINED = np.linspace(0.03, 0.05, 16)
 NOISE = np.random.default_rng(0).standard_normal(16)
 NOISE -= NOISE.mean()

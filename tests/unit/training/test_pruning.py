@@ -156,6 +156,7 @@ class TestRefitted:
             "ard": True,
             "least_movement": LEAST_MOVEMENT,
             "least_of_training": LEAST_OF_TRAINING,
+            "keep_centre": False,
         }
 
     def test_the_field_is_that_of_the_trained_decoder_at_the_same_codes(self):
@@ -189,7 +190,8 @@ class TestRefitted:
     def test_all_of_the_prior_and_all_dimensions_are_the_trained_model(self):
         """What a run says nothing of along a dimension may still be what another shape needs."""
         module = module_of(ard=False)
-        found = refitted(module, SHAPES, HALF_MM, PriorParts(flow=False, least_movement=0.0, least_of_training=1.0))
+        parts = PriorParts(flow=False, least_movement=0.0, least_of_training=1.0, keep_centre=True)
+        found = refitted(module, SHAPES, HALF_MM, parts)
         assert found.facts()["rule"] == "all"
         assert found.live.tolist() == list(range(SIZE))
         turned = found.codes / found.prior.sigma
