@@ -29,7 +29,7 @@ REGIMES: tuple[Regime, ...] = ("thin", "orthogonal")
 CASES = 24
 #: A prior is as good when its error, and twice the standard error of the difference more, is no more than this share
 #: above that of the model as it was trained.
-MARGIN = 0.005
+MARGIN = 0.002
 #: Models that are measured at most: the trained one with every precision, and two fitted ones.
 MODELS = len(PRECISIONS) + 2
 

@@ -20,7 +20,7 @@ NOISE -= NOISE.mean()
         ({PARTS: -0.01 + 1e-3 * NOISE, WIDE: -0.02}, Choice(PARTS, 0.03, 0.04)),
         ({PARTS: 0.0, WIDE: -0.02}, Choice(PARTS, 0.04, 0.04)),
         ({PARTS: 1e-3 * NOISE, WIDE: 1e-5 * NOISE}, Choice(WIDE, 0.04, 0.04)),
-        ({PARTS: 0.01, WIDE: 1e-4 + 1e-5 * NOISE}, Choice(WIDE, 0.0401, 0.04)),
+        ({PARTS: 0.01, WIDE: 5e-5 + 1e-5 * NOISE}, Choice(WIDE, 0.04005, 0.04)),
         ({PARTS: 0.01, WIDE: 0.01}, Choice(WHOLE, 0.04, 0.04)),
         ({PARTS: -0.001 + 3e-3 * NOISE, WIDE: 1e-3 * NOISE}, Choice(WHOLE, 0.04, 0.04)),
     ],
