@@ -4,7 +4,6 @@ For each case and perturbation: average surface distance against the dense mask,
 drawing, and whether the answer says that it is not reliable.
 """
 
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,8 +95,7 @@ def perturbations() -> Iterator[Perturbation]:
     yield Perturbation("planes end inside, orthogonal", orthogonal, lambda s: cut_off(orthogonal(s)), here)
     yield Perturbation("thick slices", _regime("thin"), _regime("thick"), here)
     for degrees in TILTS_DEGREES:
-        tilt = functools.partial(_tilted, degrees=degrees)
-        yield Perturbation(f"slices leaning by {degrees:g} degrees", five, tilt, here)
+        yield Perturbation(f"slices leaning by {degrees:g} degrees", five, _leaning(degrees), here)
     yield Perturbation("five oblique planes", five, lambda s: oblique(s.case, 5), here)
     yield Perturbation("one end only", five, lambda s: one_end(s.case.mask, s.case.grid), here)
     for kind in WRONG_KINDS:
@@ -114,10 +112,6 @@ def five(scene: Scene) -> Sections:
     return parallel(scene.case.mask, scene.case.grid)
 
 
-def _tilted(scene: Scene, degrees: float) -> Sections:
-    return tilted(scene.case, degrees)
-
-
 def orthogonal(scene: Scene) -> Sections:
     """The largest slice in each plane."""
     return _regime("orthogonal")(scene)
@@ -132,6 +126,10 @@ def _regime(name: str) -> Callable[[Scene], Sections]:
                 raise ValueError(name)
 
     return drawn
+
+
+def _leaning(degrees: float) -> Callable[[Scene], Sections]:
+    return lambda scene: tilted(scene.case, degrees)
 
 
 def _wrong(kind: WrongKind) -> Callable[[Scene], Sections]:

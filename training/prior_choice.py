@@ -63,7 +63,7 @@ def chosen_parts(
     Args:
         run: a finished run with Gaussian codes.
         parts: what is fitted, with the least share of the training's prior; with all of it, and then with all
-            dimensions, where that is not good enough.
+            dimensions and its own centre, where that is not good enough.
         cases: at least one.
         regimes: of their drawings.
         watch: called after each model that was measured.

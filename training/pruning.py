@@ -144,7 +144,7 @@ def refitted(
     less = pruned(module, keep_all=module.random)
     if not module.random:
         return less
-    codes, target = live_codes(module, less, shapes)
+    codes, target = gaussian_codes(module, shapes)
     least_share = 0.0 if module.config.prior.use_ard else parts.least_of_training
     covariance, share = shrunk_covariance(codes, target, least_share)
     with torch.no_grad():
@@ -164,11 +164,12 @@ def refitted(
 
 
 @torch.no_grad()
-def live_codes(module: AutoDecoder, less: Pruned, shapes: int) -> tuple[Codes, Float[Tensor, "k k"]]:
-    """Gaussian codes over live dimensions, and the covariance of the prior that they were trained under."""
-    everyone, kept = torch.arange(len(less.codes)), torch.from_numpy(less.live)
-    deviation = module.log_deviations(everyone)[:, kept].exp()
-    return Codes(less.codes, deviation, everyone % shapes), torch.diag(module.prior.sigma[kept].square())
+def gaussian_codes(module: AutoDecoder, shapes: int) -> tuple[Codes, Float[Tensor, "d d"]]:
+    """Codes of a training as Gaussians, and the covariance of the prior that they were trained under."""
+    means = module.code_means()
+    everyone = torch.arange(len(means))
+    deviation = module.log_deviations(everyone).exp()
+    return Codes(means, deviation, everyone % shapes), torch.diag(module.prior.sigma.square())
 
 
 @torch.no_grad()

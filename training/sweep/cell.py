@@ -224,9 +224,10 @@ def _export(place: Place, cohort: Cohort, effort: Effort, parts: PriorParts | No
 
 
 def _calibrate(part: Path, place: Place, cohort: Cohort) -> None:
-    """As the plain cell of the training was, where it is there: what differs between the two is the prior's then."""
-    if place.plain != place.bundle and is_exported(place.plain):
-        calibrate_bundle_as(part, read_manifest(place.plain)[0], cohort, threads=1)
+    """As the plain cell of the training was, where that is done: what differs between the two is the prior's then."""
+    known = read_manifest(place.plain)[0] if is_exported(place.plain) else None
+    if known is not None and known.calibration:
+        calibrate_bundle_as(part, known, cohort, threads=1)
     else:
         calibrate_bundle(part, cohort, threads=1)
 

@@ -41,7 +41,7 @@ def sweep(
     patience: Annotated[
         int, typer.Option(min=0, help="End after so many validations without a better figure; 0 never does.")
     ] = 5,
-    calibrate: Annotated[bool, typer.Option("--calibrate/--no-calibrate", help="Calibrate each cell.")] = True,
+    calibrate: Annotated[bool, typer.Option("--calibrate/--no-calibrate", help="Calibrate each training.")] = True,
     samples: Annotated[int, typer.Option(min=0, help="Generated shapes of each cell.")] = 1500,
     limit: Annotated[int | None, typer.Option(min=1, help="Measure only so many cases.")] = None,
     bundle: Annotated[

@@ -230,12 +230,14 @@ class TestSweep:
         (tmp_path / "again" / "results.jsonl").unlink()
         append(tmp_path / "again", *kept)
         known = {"spread_mm": 0.77, "fidelity": 0.42}
-        write_manifest(replace(read_manifest(plain)[0], likelihood_precision=0.37, discrepancy=known), plain)
+        facts = {"cohort": "made here"}
+        changed = replace(read_manifest(plain)[0], likelihood_precision=0.37, discrepancy=known, calibration=facts)
+        write_manifest(changed, plain)
         answer = call(*[word for word in words[:-4] if word != "--no-calibrate"], tmp_path / "again", "--jobs", 1)
         assert answer.exit_code == 0, answer.output
         found = read_manifest(fitted / "bundle")[0]
         assert (found.likelihood_precision, found.discrepancy) == (0.37, known)
-        assert found.calibration["sound_cases"] == 1
+        assert found.calibration == {**facts, "sound_drawings": 5, "sound_cases": 1}
         assert found.usual
 
     def test_the_report_is_one_file_with_tables_and_panels(self, swept, tmp_path):

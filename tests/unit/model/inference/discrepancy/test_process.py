@@ -34,6 +34,12 @@ def written_out(a, b):
 GRAM = written_out(POINTS, POINTS) + 0.2**2 * np.eye(60)
 
 
+def test_covariances_with_chosen_points_are_those_among_all():
+    chosen = np.random.default_rng(1).integers(0, len(POINTS), (len(PLACES), 7))
+    expected = np.take_along_axis(written_out(PLACES, POINTS), chosen, axis=1)
+    np.testing.assert_allclose(COVARIANCE.with_chosen(PLACES, POINTS, chosen), expected, atol=1e-5)
+
+
 def test_covariance_is_the_sum_of_its_terms():
     np.testing.assert_allclose(COVARIANCE.between(POINTS, PLACES), written_out(POINTS, PLACES), atol=1e-5)
     assert pytest.approx(0.41) == COVARIANCE.variance
@@ -94,6 +100,13 @@ def test_variance_of_a_weighted_sum():
     cross = written_out(PLACES, POINTS)
     posterior = written_out(PLACES, PLACES) - cross @ np.linalg.solve(GRAM, cross.T)
     assert PROCESS.functional_variance(PLACES, weights) == pytest.approx(weights @ posterior @ weights, rel=0.15)
+
+
+def test_points_that_were_grouped_before_give_the_same_variance():
+    grouped = PROCESS.grouped(PLACES)
+    for weights in np.random.default_rng(2).uniform(size=(2, 200)):
+        anew = PROCESS.functional_variance(PLACES, weights)
+        assert PROCESS.functional_variance(PLACES, weights, grouped) == pytest.approx(anew, rel=1e-9)
 
 
 def test_variance_of_a_sum_over_few_points_is_exact():
