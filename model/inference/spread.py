@@ -6,7 +6,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from model.inference.discrepancy.process import FEW, Discrepancy, GroupedPoints
+from model.inference.discrepancy.gathering import GatheredPoints
+from model.inference.discrepancy.process import FEW, Discrepancy
 
 
 @dataclass(frozen=True)
@@ -30,11 +31,11 @@ class LocalSpread:
         moved = np.flatnonzero(slope)
         if len(moved) <= FEW:
             return self.discrepancy.functional_variance(self.canonical[moved], slope[moved] * self.reach[moved])
-        return self.discrepancy.functional_variance(self.canonical, slope * self.reach, self._grouped)
+        return self.discrepancy.functional_variance(self.canonical, slope * self.reach, self._gathered)
 
     @cached_property
-    def _grouped(self) -> GroupedPoints:
-        return self.discrepancy.grouped(self.canonical)
+    def _gathered(self) -> GatheredPoints:
+        return self.discrepancy.gathered(self.canonical)
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,6 @@ NEGLIGIBLE = 1e-6
 #: Falls along one axis below the first are zero, and no exponent is below the second: what is smaller would be told by
 #: denormal numbers, with which processors calculate a hundred times as slowly.
 LEAST_FALL, LEAST_EXPONENT = 1e-9, np.float32(-30.0)
-#: Step of the lattices on which weights are gathered, in lengths.
-LATTICE_SHARE = 0.5
 
 Axes = tuple[Float[np.ndarray, "i"], Float[np.ndarray, "j"], Float[np.ndarray, "k"]]
 
@@ -81,33 +79,13 @@ class Covariance:
             term *= np.float32(sd * sd)
             np.add(result, term, out=result) if number else np.copyto(result, term)
 
-    def quadratic_form(self, points: Float[np.ndarray, "m 3"], weights: Float[np.ndarray, "m"]) -> float:
-        """``sum_mn weights_m weights_n k(points_m, points_n)``: the variance of a weighted sum of the process.
-
-        For each term the weights are gathered in the cells of a lattice of half its length. Places that are uniform
-        in their cells blur the covariance by a variance of a sixth of the squared step; one that is as much
-        narrower, and higher, makes up for it.
-        """
-        total, narrowed = 0.0, 1.0 - LATTICE_SHARE**2 / 6.0
-        for sd, length in zip(self.sds, self.lengths, strict=True):
-            cells = np.floor((points - points.min(axis=0)) / (LATTICE_SHARE * length)).astype(int)
-            shape = tuple(cells.max(axis=0) + 1)
-            gathered = np.bincount(np.ravel_multi_index(tuple(cells.T), shape), weights, int(np.prod(shape)))
-            smooth = gathered = gathered.reshape(shape).astype(np.float32)
-            for count in reversed(shape):
-                nodes = np.arange(count, dtype=float)
-                falls = _falls(nodes, nodes, narrowed**0.5 / LATTICE_SHARE)
-                smooth = np.tensordot(falls, smooth, (1, 2))
-            total += sd * sd * narrowed**-1.5 * float(np.sum(gathered * smooth, dtype=float))
-        return total
-
     def summed_on(
         self, axes: Axes, points: Float[np.ndarray, "m 3"], weights: Float[np.ndarray, "m"]
     ) -> Float[np.ndarray, "i j k"]:
         """``sum_m weights_m k(x, points_m)`` at the nodes of a lattice, given by its coordinates along each axis."""
         total = np.zeros(tuple(len(axis) for axis in axes), np.float32)
         for sd, length in zip(self.sds, self.lengths, strict=True):
-            x, y, z = (_falls(axis, points[:, number], length) for number, axis in enumerate(axes))
+            x, y, z = (falls(axis, points[:, number], length) for number, axis in enumerate(axes))
             z *= (sd * sd * weights).astype(np.float32)
             for row, along in enumerate(x):
                 near = along > NEGLIGIBLE
@@ -120,7 +98,7 @@ class Covariance:
         for sd, length in zip(self.sds, self.lengths, strict=True):
             field = random.standard_normal(total.shape).astype(np.float32)
             for axis in reversed(axes):
-                field = np.tensordot(_root(_falls(axis, axis, length)), field, (1, 2))
+                field = np.tensordot(_root(falls(axis, axis, length)), field, (1, 2))
             total += np.float32(sd) * field
         return total
 
@@ -131,6 +109,7 @@ def _root(covariance: Float[np.ndarray, "i i"]) -> Float[np.ndarray, "i i"]:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)), np.float32)
 
 
-def _falls(axis: Float[np.ndarray, "i"], coordinate: Float[np.ndarray, "m"], length: float) -> Float[np.ndarray, "i m"]:
-    falls = np.exp(-0.5 * np.square((axis[:, None] - coordinate) / length))
-    return np.where(falls < LEAST_FALL, 0.0, falls).astype(np.float32)
+def falls(axis: Float[np.ndarray, "i"], coordinate: Float[np.ndarray, "m"], length: float) -> Float[np.ndarray, "i m"]:
+    """What distance along one axis leaves of a term's variance."""
+    left = np.exp(-0.5 * np.square((axis[:, None] - coordinate) / length))
+    return np.where(left < LEAST_FALL, 0.0, left).astype(np.float32)

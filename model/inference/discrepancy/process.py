@@ -21,6 +21,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial import cKDTree
 
 from model.inference.discrepancy.covariance import Axes, Covariance
+from model.inference.discrepancy.gathering import GatheredPoints
 from model.inference.discrepancy.grouping import cells_of, means_of
 
 #: ``C``: distances from the surface count up to about this (mm).
@@ -29,8 +30,6 @@ REACH_MM = 3.0
 LATTICE_STEPS = 1.75
 #: Step of the differences that give the gradient (mm).
 DIFFERENCE_MM = 0.02
-#: Size of the cells whose points are taken together in a functional, in shortest lengths.
-GROUP_SHARE = 0.8
 #: Contour points that tell the variance at a point, and how far they hold it.
 NEAREST = 64
 #: Size of the cells whose points have these in common, in shortest lengths.
@@ -39,19 +38,6 @@ PATCH_SHARE = 3.0
 FEW = 32
 #: Evaluations of the covariance in one piece; bounds memory.
 PIECE = 1 << 22
-
-
-@dataclass(frozen=True)
-class GroupedPoints:
-    """Points of which those closer than the process can tell apart are taken together for what the contours explain.
-
-    Attributes:
-        cells: (m,) number of each point's group.
-        seen: (n, c) covariance (mm^2) of each observation with the middle of each group.
-    """
-
-    cells: Int[np.ndarray, "m"]
-    seen: Float[np.ndarray, "n c"]
 
 
 @dataclass(frozen=True)
@@ -179,25 +165,24 @@ class Discrepancy:
         self,
         canonical: Float[np.ndarray, "m 3"],
         weights: Float[np.ndarray, "m"],
-        grouped: GroupedPoints | None = None,
+        gathered: GatheredPoints | None = None,
     ) -> float:
         """Posterior variance of ``sum_m weights_m delta(u_m)`` (square of the weights' unit times mm^2).
 
         Args:
-            grouped: of the same points, where somebody has them already.
+            gathered: the same points, where somebody has them already.
         """
         if len(canonical) <= FEW:
             prior = float(weights @ self.covariance.between(canonical, canonical) @ weights)
             return max(0.0, prior - float(np.square(self.whitened(canonical) @ weights).sum()))
-        known = self.grouped(canonical) if grouped is None else grouped
-        seen = known.seen @ np.bincount(known.cells, weights).astype(np.float32)
-        explained = solve_triangular(self._factor[0], seen.astype(float), lower=True)
-        return max(0.0, self.covariance.quadratic_form(canonical, weights) - float(explained @ explained))
+        known = self.gathered(canonical) if gathered is None else gathered
+        seen = known.covariances_with(self.points, weights)
+        explained = solve_triangular(self._factor[0], seen, lower=True)
+        return max(0.0, known.variance_of(weights) - float(explained @ explained))
 
-    def grouped(self, canonical: Float[np.ndarray, "m 3"]) -> GroupedPoints:
+    def gathered(self, canonical: Float[np.ndarray, "m 3"]) -> GatheredPoints:
         """Many points for `functional_variance`."""
-        cells = cells_of(canonical, GROUP_SHARE * min(self.covariance.lengths))
-        return GroupedPoints(cells, self.covariance.between(self.points, means_of(cells, canonical)))
+        return GatheredPoints.of(self.covariance, canonical)
 
     def __getstate__(self) -> dict[str, object]:
         """What it was made of; what is computed from that is several times as large and does not travel."""

@@ -25,6 +25,17 @@ PROCESS = Discrepancy(
 PLACES = RANDOM.uniform(-11.0, 11.0, (200, 3))
 
 
+def on_a_ball(count):
+    """Places spread evenly on a ball of 11 mm, as close to each other as vertices are."""
+    heights = np.linspace(-1.0, 1.0, count)
+    around, turn = np.sqrt(1.0 - heights**2), np.pi * (3.0 - 5.0**0.5) * np.arange(count)
+    return 11.0 * np.stack([around * np.cos(turn), around * np.sin(turn), heights], axis=1)
+
+
+VERTICES = on_a_ball(1500)
+AREAS = 1.0 + 0.4 * np.sin(VERTICES @ [0.2, 0.1, -0.3])
+
+
 def written_out(a, b):
     squared = np.square(a[:, None] - b[None]).sum(axis=-1)
     terms = zip(COVARIANCE.sds, COVARIANCE.lengths, strict=True)
@@ -96,17 +107,16 @@ def test_what_a_parameter_moves_is_taken_back_at_the_contours():
 
 
 def test_variance_of_a_weighted_sum():
-    weights = RANDOM.uniform(size=200)
-    cross = written_out(PLACES, POINTS)
-    posterior = written_out(PLACES, PLACES) - cross @ np.linalg.solve(GRAM, cross.T)
-    assert PROCESS.functional_variance(PLACES, weights) == pytest.approx(weights @ posterior @ weights, rel=0.15)
+    cross = written_out(VERTICES, POINTS)
+    posterior = written_out(VERTICES, VERTICES) - cross @ np.linalg.solve(GRAM, cross.T)
+    assert PROCESS.functional_variance(VERTICES, AREAS) == pytest.approx(AREAS @ posterior @ AREAS, rel=0.005)
 
 
-def test_points_that_were_grouped_before_give_the_same_variance():
-    grouped = PROCESS.grouped(PLACES)
-    for weights in np.random.default_rng(2).uniform(size=(2, 200)):
-        anew = PROCESS.functional_variance(PLACES, weights)
-        assert PROCESS.functional_variance(PLACES, weights, grouped) == pytest.approx(anew, rel=1e-9)
+def test_points_that_were_gathered_before_give_the_same_variance():
+    gathered = PROCESS.gathered(VERTICES)
+    for weights in (AREAS, VERTICES[:, 0]):
+        anew = PROCESS.functional_variance(VERTICES, weights)
+        assert PROCESS.functional_variance(VERTICES, weights, gathered) == pytest.approx(anew, rel=1e-9)
 
 
 def test_variance_of_a_sum_over_few_points_is_exact():
@@ -146,7 +156,8 @@ def on_a_cylinder(angles, heights):
 def test_variance_by_the_nearest_contours_is_nearly_that_by_all():
     around, slices = np.meshgrid(np.linspace(0, 2 * np.pi, 42, endpoint=False), np.linspace(-20.0, 20.0, 9))
     points = on_a_cylinder(around.ravel(), slices.ravel())
-    places = on_a_cylinder(RANDOM.uniform(0, 2 * np.pi, 300), RANDOM.uniform(-22.0, 22.0, 300))
+    turns, heights = np.meshgrid(np.linspace(0, 2 * np.pi, 37, endpoint=False), np.linspace(-22.0, 22.0, 23))
+    places = on_a_cylinder(turns.ravel(), heights.ravel())
     assert len(points) > 3 * NEAREST
     moves = np.column_stack([np.ones(len(points)), points / 10.0])
     process = replace(PROCESS, points=points, residuals=np.zeros(len(points)), jacobian=moves)
@@ -157,9 +168,3 @@ def test_variance_by_the_nearest_contours_is_nearly_that_by_all():
     carried, variance = process.held(places)
     np.testing.assert_array_equal(variance, process.variance(places))
     assert np.abs(carried - process.carried(places)).max() < 0.05 * np.abs(carried).max()
-
-
-def test_quadratic_form_is_the_variance_of_a_sum():
-    weights = RANDOM.uniform(size=200)
-    expected = weights @ written_out(PLACES, PLACES) @ weights
-    assert COVARIANCE.quadratic_form(PLACES, weights) == pytest.approx(expected, rel=0.02)
