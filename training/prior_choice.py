@@ -56,6 +56,7 @@ def chosen_parts(
     parts: PriorParts,
     cases: Sequence[Case],
     regimes: Sequence[Regime] = REGIMES,
+    precisions: Sequence[float] = PRECISIONS,
     watch: Watch = lambda: None,
 ) -> Choice:
     """The most fitted prior with which shapes that were not trained on are reconstructed as well as with the trained.
@@ -66,6 +67,7 @@ def chosen_parts(
             dimensions and its own centre, where that is not good enough.
         cases: at least one.
         regimes: of their drawings.
+        precisions: likelihood precisions (1/mm^2) that the model may come to be used at.
         watch: called after each model that was measured.
 
     Raises:
@@ -80,7 +82,7 @@ def chosen_parts(
         return found
 
     as_trained = trial_model(run, None)
-    trained = {precision: errors(as_trained, precision) for precision in PRECISIONS}
+    trained = {precision: errors(as_trained, precision) for precision in precisions}
     best = min(trained, key=lambda precision: float(trained[precision].mean()))
     return choice_by(trained[best], lambda candidate: errors(trial_model(run, candidate), best), parts)
 

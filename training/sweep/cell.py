@@ -11,7 +11,7 @@ import numpy as np
 
 from model.bundle import Manifest, ShapeModel, open_bundle, read_manifest
 from model.errors import InvalidParameter
-from training.calibration import calibrate_bundle, calibrate_bundle_as
+from training.calibration import PRECISIONS, calibrate_bundle, calibrate_bundle_as
 from training.choices import (
     DeviceName,
     ObjectiveName,
@@ -27,7 +27,7 @@ from training.evaluate import Method, fills_of, measure
 from training.generation import SAMPLES, generated
 from training.prior_choice import chosen_parts
 from training.pruning import PriorParts
-from training.release import active_dimensions, export_run
+from training.release import UNCALIBRATED_PRECISION, active_dimensions, export_run
 from training.runs import CHECKPOINT, Run, is_finished, prepare
 from training.sparsify import for_evaluation
 from training.sweep.plan import Cell
@@ -115,7 +115,7 @@ def run_cell(
         config = config_of(cell, cohort, effort, device, known=known)
         if not is_finished(place.run, cohort, config):
             prepared(cohort, config, place.run).go(lambda step, _: watch("training", step, config.steps))
-        _export(place, cohort, effort, _parts(cell, place, cohort))
+        _export(place, cohort, effort, _parts(cell, place, cohort, effort))
     model = open_bundle(place.bundle, threads=1)
     return result_of(cell, model, cohort, effort, time.perf_counter() - begin, watch)
 
@@ -133,12 +133,16 @@ def parts_of(cell: Cell) -> PriorParts | None:
     return None if cell.prior is PriorName.PLAIN else PriorParts(flow=cell.prior.flow, ard=cell.prior.ard)
 
 
-def _parts(cell: Cell, place: Place, cohort: Cohort) -> PriorParts | None:
-    """What is fitted, with as much of the training's prior as validation shapes want."""
+def _parts(cell: Cell, place: Place, cohort: Cohort, effort: Effort) -> PriorParts | None:
+    """What is fitted, with as much of the training's prior as validation shapes want.
+
+    They want it at the likelihood precision that the cell is measured with; one that is not calibrated has but one.
+    """
     parts = parts_of(cell)
     if parts is None or cell.together or not cohort.validation:
         return parts
-    return chosen_parts(place.run, parts, cohort.validation, cell.measured_in).parts
+    precisions = PRECISIONS if effort.calibrate else (UNCALIBRATED_PRECISION,)
+    return chosen_parts(place.run, parts, cohort.validation, cell.measured_in, precisions).parts
 
 
 def config_of(cell: Cell, cohort: Cohort, effort: Effort, device: DeviceName, *, known: bool) -> TrainingConfig:

@@ -21,7 +21,9 @@ from model.errors import InvalidParameter
 from training.choices import DeviceName
 from training.cli import register
 from training.cohorts import CohortOptions
-from training.cohorts.sources import CohortSource
+from training.cohorts.sources import CohortSource, open_cohort
+from training.prior_choice import chosen_parts
+from training.pruning import PriorParts
 from training.sweep.cell import Effort
 from training.sweep.plan import Cell, by_training, cells_of
 from training.sweep.priors import PriorName
@@ -219,6 +221,18 @@ class TestSweep:
         assert answer.exit_code == 0, answer.output
         (one,) = read_results(tmp_path)
         assert (one.prior, checkpoint.stat().st_mtime_ns) == (prior, before)
+
+    def test_a_prior_is_chosen_at_the_precision_that_the_cell_is_measured_with(self, swept, masks):
+        folder, _, _ = swept
+        (run,) = (folder / "trainings").glob("*/run")
+        (fitted,) = (folder / "cells").glob("*-flow-ard-*/bundle")
+        cases = open_cohort(CohortSource(masks=masks), CohortOptions()).validation
+        measured = []
+        choice = chosen_parts(run, PriorParts(), cases, ("thin",), (0.1,), lambda: measured.append(1))
+        assert len(measured) <= 3
+        manifest = read_manifest(fitted)[0]
+        assert manifest.likelihood_precision == 0.1
+        assert manifest.training["pruned"]["least_of_training"] == choice.parts.least_of_training
 
     def test_cells_of_a_training_trust_drawings_as_its_plain_one_does(self, swept, tmp_path):
         folder, words, _ = swept
