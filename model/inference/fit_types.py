@@ -40,6 +40,8 @@ class FitOptions:
     Attributes:
         mirror: whether left and right may be exchanged.
         any_orientation: whether half turns about the canonical axes are tried too, for drawings whose axes are unknown.
+        screened: whether starts are looked for among many places of the mean shape; of drawings on one or two planes
+            they always are.
         robust: whether planes that contradict all others are left out.
         position_sd_mm, rotation_sd, log_scale_sd: pose prior around the starting pose; rotation in rad.
         max_iterations: Levenberg-Marquardt iterations of one start.
@@ -48,6 +50,7 @@ class FitOptions:
 
     mirror: MirrorRule = "never"
     any_orientation: bool = False
+    screened: bool = False
     robust: bool = True
     position_sd_mm: float = 20.0
     rotation_sd: float = 0.15

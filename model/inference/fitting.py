@@ -6,7 +6,7 @@ then left out (`model.inference.leave_out`). The objective is that of `model.inf
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -20,6 +20,7 @@ from model.inference.fit_types import Fit, FitOptions, FitStatus, MirrorRule
 from model.inference.leave_out import contradicting_plane, most_wrong
 from model.inference.objective import Objective, Place, pose_offset, reweighted
 from model.inference.observations import Observations, thinned
+from model.inference.screening import screened_poses
 
 __all__ = [
     "Fit",
@@ -50,13 +51,35 @@ MEAN_SHARE, SHORT_SHARE = 0.8, 0.55
 IN_PLANE = 0.4
 #: A section of fewer observations tells no normal.
 FEWEST_IN_SECTION = 10
+#: On so few planes the drawing's centroid says little about the object's.
+FEW_PLANES = 2
+
+
+@dataclass(frozen=True)
+class Start:
+    """A pose that a fit starts from, and the one that its prior is around."""
+
+    pose: Pose
+    around: Pose
 
 
 def fit(model: ShapeModel, observations: Observations, options: FitOptions) -> Fit:
     """The best of the fits from every starting pose that the options allow, less planes that contradict the others."""
-    poses = starting_poses(observations, options)
-    found = _from_starts(model, observations, [*poses, *_poses_beyond(model, observations, poses)], options)
+    found = _from_starts(model, observations, _starts(model, observations, options), options)
     return _without_wrong_planes(model, observations, found, options) if options.robust else found
+
+
+def _starts(model: ShapeModel, observations: Observations, options: FitOptions) -> list[Start]:
+    """The starting poses, those beyond a short drawing, and where so few planes, or the caller, want it many more."""
+    poses = starting_poses(observations, options)
+    usual = [Start(pose, pose) for pose in [*poses, *_poses_beyond(model, observations, poses)]]
+    if not options.screened and len(np.unique(observations.plane_of[observations.weights > 0])) > FEW_PLANES:
+        return usual
+    return usual + [
+        Start(screened, pose)
+        for pose in poses
+        for screened in screened_poses(model, observations, pose, COARSE_SHARPNESS)
+    ]
 
 
 def searched(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Fit:
@@ -84,7 +107,7 @@ def _without_wrong_planes(
         trust[verdict.plane] = 0.0
         trusted = reweighted(observations, trust)
         poses = starting_poses(trusted, options)
-        anew = _from_starts(model, trusted, poses, options)
+        anew = _from_starts(model, trusted, [Start(pose, pose) for pose in poses], options)
         on = _from_place(model, trusted, found, poses[0], options)
         found = min(anew, on, key=lambda one: one.objective)
     return replace(found, plane_weights=trust, doubted=doubted)
@@ -160,20 +183,18 @@ def fit_from(
     latent: Float[np.ndarray, "d"] | None = None,
 ) -> Fit:
     """Fit from one starting pose, and one starting code (the centre of the latent space when None)."""
-    code = np.zeros(model.manifest.latent_size) if latent is None else latent
-    (coarse,) = _coarse(model, observations, [Place(code, start)], options)
+    (coarse,) = _coarse(model, observations, [Start(start, start)], options, latent=latent)
     (fine,) = descend([Objective(model, observations, start, options)], [_place(coarse)], 1.0, options)
     return fit_of(fine, coarse.iterations)
 
 
-def _from_starts(model: ShapeModel, observations: Observations, poses: Sequence[Pose], options: FitOptions) -> Fit:
-    """The best of the fits from several poses; those that fall behind early are not finished."""
-    starts = [Place(np.zeros(model.manifest.latent_size), pose) for pose in poses]
+def _from_starts(model: ShapeModel, observations: Observations, starts: Sequence[Start], options: FitOptions) -> Fit:
+    """The best of the fits from several starts; those that fall behind early are not finished."""
     coarse = _coarse(model, observations, starts, options, _give_up_those_behind)
     last = _limit(coarse, BEHIND_SHARE[1])
     rest = [number for number, one in enumerate(coarse) if one.point.value <= last]
     fine = descend(
-        [Objective(model, observations, poses[number], options) for number in rest],
+        [Objective(model, observations, starts[number].around, options) for number in rest],
         [_place(coarse[number]) for number in rest],
         1.0,
         options,
@@ -185,15 +206,17 @@ def _from_starts(model: ShapeModel, observations: Observations, poses: Sequence[
 def _coarse(
     model: ShapeModel,
     observations: Observations,
-    starts: Sequence[Place],
+    starts: Sequence[Start],
     options: FitOptions,
     referee: Referee = lambda problems: None,
+    latent: Float[np.ndarray, "d"] | None = None,
 ) -> list[Descent]:
     """The first stage, from all starts side by side: blunt logits on few observations."""
     rough = thinned(observations, _coarse_step(len(observations.points)), seed=0)
+    code = np.zeros(model.manifest.latent_size) if latent is None else latent
     return descend(
-        [Objective(model, rough, start.pose, options) for start in starts],
-        starts,
+        [Objective(model, rough, start.around, options) for start in starts],
+        [Place(code, start.pose) for start in starts],
         COARSE_SHARPNESS,
         replace(options, tolerance=COARSE_TOLERANCE, max_iterations=COARSE_ITERATIONS),
         referee,

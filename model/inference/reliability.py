@@ -7,7 +7,7 @@ SD: few planes, badly placed ones). Both are held against what sound drawings of
 A drawing with a high misfit is trusted less: the fit goes on with a lower likelihood precision.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from model.bundle import ShapeModel
 from model.inference.discrepancy.conditioning import DiscrepancyPrior, corrected
-from model.inference.fitting import Fit, FitOptions, refit, searched
+from model.inference.fitting import Fit, FitOptions, fit, refit, searched
 from model.inference.mask_stack import MaskStack, Plane, section_of
 from model.inference.mesh import Mesh, volume_ml
 from model.inference.observations import Observations
@@ -99,21 +99,31 @@ def less_trusting(
 ) -> tuple[ShapeModel, Fit]:
     """Model and fit with less trust in the drawing when that is rough, otherwise as they are.
 
-    First a single plane that is to blame is looked for, more thoroughly than in any fit. Drawings on thick slices are
-    not judged. A fit that is found good comes back with its discrepancy.
+    First a better place and a single plane that is to blame are looked for, more thoroughly than in any fit. Drawings
+    on thick slices are not judged. A fit that is found good comes back with its discrepancy.
     """
     if any(thickness_mm(stacks[plane.stack], plane) for plane in observations.planes):
         return model, found
-    judged = corrected(model, found, stacks, observations, prior)
-    if not _is_rough(model, judged, observations):
-        return model, judged
-    found = searched(model, observations, found, options)
-    judged = corrected(model, found, stacks, observations, prior)
-    if not _is_rough(model, judged, observations):
-        return model, judged
+    for tried in _ever_harder(model, observations, found, options):
+        judged = corrected(model, tried, stacks, observations, prior)
+        if not _is_rough(model, judged, observations):
+            return model, judged
     lower = ROUGH_SHARE * model.manifest.likelihood_precision
     doubting = replace(model, manifest=replace(model.manifest, likelihood_precision=lower))
-    return doubting, refit(doubting, observations, found, options)
+    return doubting, refit(doubting, observations, tried, options)
+
+
+def _ever_harder(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Iterator[Fit]:
+    """The fit, then better ones as long as they are asked for: from more starts, and without a wrong plane."""
+    yield found
+    found = min(found, fit(model, observations, replace(options, screened=True)), key=_badness)
+    yield found
+    yield searched(model, observations, found, options)
+
+
+def _badness(found: Fit) -> tuple[int, float]:
+    """Planes that a fit leaves out, and how improbable it is by the others."""
+    return 0 if found.plane_weights is None else int((found.plane_weights == 0).sum()), found.objective
 
 
 def _is_rough(model: ShapeModel, judged: Fit, observations: Observations) -> bool:
