@@ -60,6 +60,19 @@ class FitOptions:
 
 
 @dataclass(frozen=True)
+class Rival:
+    """Another optimum that is nearly as probable and lies elsewhere.
+
+    Attributes:
+        nats: how much less probable it is.
+        distance_mm: how far away the object lies, RMS over points within it.
+    """
+
+    nats: float
+    distance_mm: float
+
+
+@dataclass(frozen=True)
 class Fit:
     """What the solver found.
 
@@ -73,6 +86,7 @@ class Fit:
         plane_weights: (k,) trust in each annotated plane: 0 for one that contradicts the others and was left out of
             the fit, else 1; None when that was not looked into.
         doubted: number of a plane that stands out from the others, though too little to be left out, or None.
+        rival: another optimum, of those that starts led to, that the drawing hardly tells from this one; None without.
         discrepancy: what the drawn contours show and the code cannot express; None when it was not asked for.
     """
 
@@ -85,4 +99,5 @@ class Fit:
     precision: Float[np.ndarray, "p p"]
     plane_weights: Float[np.ndarray, "k"] | None = None
     doubted: int | None = None
+    rival: Rival | None = None
     discrepancy: Discrepancy | None = None

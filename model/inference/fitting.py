@@ -20,6 +20,7 @@ from model.inference.fit_types import Fit, FitOptions, FitStatus, MirrorRule
 from model.inference.leave_out import contradicting_plane, most_wrong
 from model.inference.objective import Objective, Place, pose_offset, reweighted
 from model.inference.observations import Observations, thinned
+from model.inference.rivals import rival_of
 from model.inference.screening import screened_poses
 
 __all__ = [
@@ -116,7 +117,8 @@ def _without_wrong_planes(
 def _from_place(model: ShapeModel, observations: Observations, found: Fit, start: Pose, options: FitOptions) -> Fit:
     """Go on from another fit, with the pose's prior around a start."""
     objective = Objective(model, observations, replace(start, mirrored=found.pose.mirrored), options)
-    return fit_of(descend([objective], [Place(found.latent, found.pose)], 1.0, options)[0], found.iterations)
+    anew = fit_of(descend([objective], [Place(found.latent, found.pose)], 1.0, options)[0], found.iterations)
+    return replace(anew, rival=found.rival)
 
 
 def refit(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Fit:
@@ -124,7 +126,7 @@ def refit(model: ShapeModel, observations: Observations, found: Fit, options: Fi
     if found.plane_weights is not None:
         observations = reweighted(observations, found.plane_weights)
     anew = _from_place(model, observations, found, starting_poses(observations, options)[0], options)
-    return replace(anew, plane_weights=found.plane_weights, doubted=found.doubted)
+    return replace(anew, plane_weights=found.plane_weights, doubted=found.doubted, rival=found.rival)
 
 
 def starting_poses(observations: Observations, options: FitOptions) -> Sequence[Pose]:
@@ -200,7 +202,8 @@ def _from_starts(model: ShapeModel, observations: Observations, starts: Sequence
         options,
     )
     best = min(range(len(rest)), key=lambda place: fine[place].point.value)
-    return fit_of(fine[best], coarse[rest[best]].iterations)
+    rival = rival_of(fine[best].point, [one.point for one in fine], np.asarray(model.manifest.half_extent_mm))
+    return replace(fit_of(fine[best], coarse[rest[best]].iterations), rival=rival)
 
 
 def _coarse(

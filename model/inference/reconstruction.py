@@ -21,6 +21,7 @@ from model.inference.objective import Place, reweighted
 from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
 from model.inference.posterior import FieldDerivatives, fitted_logits, laplace_covariance
 from model.inference.reliability import figures_of, less_trusting, reliability_warnings, thickness_warnings
+from model.inference.rivals import rival_warnings
 from model.inference.surface import differentiated_surface, surface_of
 from model.inference.thick_slices import through_thickness
 from model.inference.typicality import (
@@ -174,6 +175,7 @@ def reconstruct(
         log_prior_density=density,
         typicality_percentile=percentile,
         warnings=_warnings(found)
+        + rival_warnings(found)
         + typicality_warnings(model, percentile)
         + plane_warnings(sections, _doubted(observations, found))
         + predictive_warnings(sections, probabilities, named)
