@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import nibabel as nib
 import numpy as np
@@ -232,7 +232,7 @@ class TestSweep:
         assert len(measured) <= 3
         manifest = read_manifest(fitted)[0]
         assert manifest.likelihood_precision == 0.1
-        assert manifest.training["pruned"]["least_of_training"] == choice.parts.least_of_training
+        assert manifest.training["pruned"]["fitted"] == asdict(choice.parts)
 
     def test_cells_of_a_training_trust_drawings_as_its_plain_one_does(self, swept, tmp_path):
         folder, words, _ = swept
