@@ -127,3 +127,10 @@ def spheroid_area_cm2(equatorial: float, polar: float) -> float:
         return float(2.0 * np.pi * equatorial * np.sin(angle) * slope)
 
     return float(quad(ring, 0.0, np.pi)[0] / 100.0)
+
+
+def spread_on_a_ball(count: int, radius_mm: float) -> Float[np.ndarray, "n 3"]:
+    """Points (mm) spread evenly on a ball around the origin, along a spiral of golden angles."""
+    heights = np.linspace(-1.0, 1.0, count)
+    around, turns = np.sqrt(1.0 - heights**2), np.pi * (3.0 - 5.0**0.5) * np.arange(count)
+    return radius_mm * np.stack([around * np.cos(turns), around * np.sin(turns), heights], axis=1)

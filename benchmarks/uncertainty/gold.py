@@ -17,12 +17,13 @@ from model.bundle import ShapeModel
 from model.geometry import Pose
 from model.inference.ensemble import fit_ensemble
 from model.inference.estimates import interval_reach
-from model.inference.fitting import Fit, FitOptions, fit, starting_poses
+from model.inference.fitting import Fit, FitOptions, fit
 from model.inference.mesh import Mesh, vertex_areas
 from model.inference.objective import Objective
 from model.inference.observations import Observations, observe, thinned
 from model.inference.posterior import fitted_jacobians, fitted_logits, laplace_covariance, normal_displacements
 from model.inference.reconstruction import OBSERVATION_BUDGET
+from model.inference.starts import starting_poses
 from model.inference.surface import surface_of
 from training.cohorts.cohort import Case
 from training.sparsify import Regime, for_evaluation

@@ -6,14 +6,11 @@ then left out (`model.inference.leave_out`). The objective is that of `model.inf
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 
 from model.bundle import ShapeModel
-from model.errors import InvalidMask
 from model.geometry import Pose
 from model.inference.descent import Descent, Referee, descend
 from model.inference.fit_types import Fit, FitOptions, FitStatus, MirrorRule
@@ -21,7 +18,7 @@ from model.inference.leave_out import contradicting_plane, most_wrong
 from model.inference.objective import Objective, Place, pose_offset, reweighted
 from model.inference.observations import Observations, thinned
 from model.inference.rivals import rival_of
-from model.inference.screening import screened_poses
+from model.inference.starts import Start, starting_poses, starts_of
 
 __all__ = [
     "Fit",
@@ -34,7 +31,6 @@ __all__ = [
     "pose_offset",
     "refit",
     "searched",
-    "starting_poses",
 ]
 
 #: Logits of the coarse stage are multiplied by this.
@@ -46,41 +42,13 @@ COARSE_TOLERANCE, COARSE_ITERATIONS = 1.0, 8
 #: A start is given up when after so many coarse iterations, or at their end, its objective exceeds the best one's by
 #: more than this many nats and this share of it.
 TRIAL_ITERATIONS, BEHIND_NATS, BEHIND_SHARE = 3, 10.0, (1.0, 0.25)
-#: Objects fill about this share of the model's box; a drawing shorter than the second share of that may be of one end.
-MEAN_SHARE, SHORT_SHARE = 0.8, 0.55
-#: A plane shows the object's extent along axes that it is inclined to by less than this (sine).
-IN_PLANE = 0.4
-#: A section of fewer observations tells no normal.
-FEWEST_IN_SECTION = 10
-#: On so few planes the drawing's centroid says little about the object's.
-FEW_PLANES = 2
-
-
-@dataclass(frozen=True)
-class Start:
-    """A pose that a fit starts from, and the one that its prior is around."""
-
-    pose: Pose
-    around: Pose
 
 
 def fit(model: ShapeModel, observations: Observations, options: FitOptions) -> Fit:
     """The best of the fits from every starting pose that the options allow, less planes that contradict the others."""
-    found = _from_starts(model, observations, _starts(model, observations, options), options)
+    starts = starts_of(model, observations, options, COARSE_SHARPNESS)
+    found = _from_starts(model, observations, starts, options)
     return _without_wrong_planes(model, observations, found, options) if options.robust else found
-
-
-def _starts(model: ShapeModel, observations: Observations, options: FitOptions) -> list[Start]:
-    """The starting poses, those beyond a short drawing, and where so few planes, or the caller, want it many more."""
-    poses = starting_poses(observations, options)
-    usual = [Start(pose, pose) for pose in [*poses, *_poses_beyond(model, observations, poses)]]
-    if not options.screened and len(np.unique(observations.plane_of[observations.weights > 0])) > FEW_PLANES:
-        return usual
-    return usual + [
-        Start(screened, pose)
-        for pose in poses
-        for screened in screened_poses(model, observations, pose, COARSE_SHARPNESS)
-    ]
 
 
 def searched(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Fit:
@@ -117,8 +85,7 @@ def _without_wrong_planes(
 def _from_place(model: ShapeModel, observations: Observations, found: Fit, start: Pose, options: FitOptions) -> Fit:
     """Go on from another fit, with the pose's prior around a start."""
     objective = Objective(model, observations, replace(start, mirrored=found.pose.mirrored), options)
-    anew = fit_of(descend([objective], [Place(found.latent, found.pose)], 1.0, options)[0], found.iterations)
-    return replace(anew, rival=found.rival)
+    return fit_of(descend([objective], [Place(found.latent, found.pose)], 1.0, options)[0], found.iterations)
 
 
 def refit(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Fit:
@@ -129,65 +96,9 @@ def refit(model: ShapeModel, observations: Observations, found: Fit, options: Fi
     return replace(anew, plane_weights=found.plane_weights, doubted=found.doubted, rival=found.rival)
 
 
-def starting_poses(observations: Observations, options: FitOptions) -> Sequence[Pose]:
-    """Poses at the centroid of the drawn foreground, one for each side and orientation that may be tried.
-
-    Raises:
-        InvalidMask: no observation is foreground, as when thinning out many planes left none that holds any.
-    """
-    inside = observations.weights * observations.labels
-    if not inside.any():
-        raise InvalidMask(
-            "mask holds no foreground on the planes that were sampled from it; fewer annotated planes are accepted",
-            part="mask",
-        )
-    centre = inside @ observations.points / inside.sum()
-    sides = {"never": (False,), "always": (True,), "auto": (False, True)}[options.mirror]
-    turns = [np.eye(3)]
-    if options.any_orientation:
-        turns += [Rotation.from_rotvec(np.pi * axis).as_matrix() for axis in np.eye(3)]
-    return [Pose(centre, turn, mirrored=side) for side in sides for turn in turns]
-
-
-def _poses_beyond(model: ShapeModel, observations: Observations, poses: Sequence[Pose]) -> list[Pose]:
-    """Poses with the object's middle to both sides of the drawing, where that is short for an object of this kind.
-
-    From the centroid of one drawn end the fit would turn and squeeze the object into that end.
-    """
-    drawn = (observations.labels > 0) & (observations.weights > 0)
-    inside, plane_of = observations.points[drawn], observations.plane_of[drawn]
-    sizes = 2.0 * MEAN_SHARE * np.asarray(model.manifest.half_extent_mm)
-    # Between slices, half a gap to either side of the drawing may hold some of the object as well.
-    extents = np.ptp(inside, axis=0) * (1.0 + 1.0 / max(len(np.unique(plane_of)) - 1, 1))
-    shares = np.where(_shown(inside, plane_of), np.inf, extents / sizes)
-    axis = int(np.argmin(shares))
-    if shares[axis] > SHORT_SHARE:
-        return []
-    shift = 0.5 * (sizes[axis] - extents[axis]) * np.eye(3)[axis]
-    return [replace(pose, position=pose.position + side * shift) for pose in poses for side in (-1.0, 1.0)]
-
-
-def _shown(points: Float[np.ndarray, "n 3"], plane_of: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "3"]:
-    """Along which axes some plane shows the whole extent, its section being closed."""
-    shown = np.zeros(3, bool)
-    for number in np.unique(plane_of):
-        section = points[plane_of == number]
-        if len(section) >= FEWEST_IN_SECTION:
-            shown |= np.abs(np.linalg.svd(section - section.mean(axis=0), full_matrices=False)[2][2]) < IN_PLANE
-    return shown
-
-
-def fit_from(
-    model: ShapeModel,
-    observations: Observations,
-    start: Pose,
-    options: FitOptions,
-    latent: Float[np.ndarray, "d"] | None = None,
-) -> Fit:
-    """Fit from one starting pose, and one starting code (the centre of the latent space when None)."""
-    (coarse,) = _coarse(model, observations, [Start(start, start)], options, latent=latent)
-    (fine,) = descend([Objective(model, observations, start, options)], [_place(coarse)], 1.0, options)
-    return fit_of(fine, coarse.iterations)
+def fit_from(model: ShapeModel, observations: Observations, start: Pose, options: FitOptions) -> Fit:
+    """Fit from one starting pose (world to canonical) and the centre of the latent space."""
+    return _from_starts(model, observations, [Start(start, start)], options)
 
 
 def _from_starts(model: ShapeModel, observations: Observations, starts: Sequence[Start], options: FitOptions) -> Fit:
@@ -211,12 +122,11 @@ def _coarse(
     observations: Observations,
     starts: Sequence[Start],
     options: FitOptions,
-    referee: Referee = lambda problems: None,
-    latent: Float[np.ndarray, "d"] | None = None,
+    referee: Referee,
 ) -> list[Descent]:
     """The first stage, from all starts side by side: blunt logits on few observations."""
     rough = thinned(observations, _coarse_step(len(observations.points)), seed=0)
-    code = np.zeros(model.manifest.latent_size) if latent is None else latent
+    code = np.zeros(model.manifest.latent_size)
     return descend(
         [Objective(model, rough, start.around, options) for start in starts],
         [Place(code, start.pose) for start in starts],

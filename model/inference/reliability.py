@@ -26,6 +26,7 @@ from model.inference.posterior import (
     normal_displacements,
     open_variance,
 )
+from model.inference.starts import has_few_planes
 from model.inference.thick_slices import thickness_mm
 
 #: Contours of which more than this share is open are called cut off: sound drawings of 16 validation shapes have none,
@@ -114,15 +115,18 @@ def less_trusting(
 
 
 def _ever_harder(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Iterator[Fit]:
-    """The fit, then better ones as long as they are asked for: from more starts, and without a wrong plane."""
+    """The fit, then better ones as long as they are asked for: from screened starts, and without a wrong plane."""
     yield found
-    found = min(found, fit(model, observations, replace(options, screened=True)), key=_badness)
-    yield found
+    if not has_few_planes(observations):
+        screened = fit(model, observations, replace(options, screened=True))
+        if _standing(screened) < _standing(found):
+            found = screened
+            yield found
     yield searched(model, observations, found, options)
 
 
-def _badness(found: Fit) -> tuple[int, float]:
-    """Planes that a fit leaves out, and how improbable it is by the others."""
+def _standing(found: Fit) -> tuple[int, float]:
+    """Planes that a fit leaves out, and its objective on the others (nats): of two fits the lower one is better."""
     return 0 if found.plane_weights is None else int((found.plane_weights == 0).sum()), found.objective
 
 

@@ -27,33 +27,32 @@ APART = 0.25
 OBSERVED = 250
 
 
-def screened_poses(
-    model: ShapeModel, observations: Observations, pose: Pose, sharpness: float, seed: int = 0
-) -> list[Pose]:
-    """Poses around one, in which the mean shape agrees best with the drawing; the best first.
+def screened_poses(model: ShapeModel, observations: Observations, pose: Pose, sharpness: float) -> list[Pose]:
+    """At most `KEPT` poses (world to canonical) in which the mean shape agrees best with the drawing; the best first.
 
     Args:
+        pose: that they lie around; a turned one has turned poses around it.
         sharpness: what logits are multiplied by.
-        seed: of the places.
     """
     seen = thinned(observations, max(1, len(observations.points) // OBSERVED), seed=0)
-    places = list(_scattered(model, pose, seed))
+    half = np.asarray(model.manifest.half_extent_mm)
+    places = list(_scattered(pose, half))
     points = np.concatenate([place.to_canonical(seen.points) for place in places])[None].astype(np.float32)
     centre = np.zeros((1, model.manifest.latent_size), np.float32)
     logits = sharpness * model.decoder.logits(centre, points).reshape(len(places), -1).astype(float)
     costs = (np.logaddexp(0.0, logits) - seen.labels * logits) @ seen.weights
-    return _apart([places[number] for number in np.argsort(costs)], np.asarray(model.manifest.half_extent_mm))
+    return _apart([places[number] for number in np.argsort(costs)], half)
 
 
-def _scattered(model: ShapeModel, pose: Pose, seed: int) -> Iterator[Pose]:
-    random, half = np.random.default_rng(seed), np.asarray(model.manifest.half_extent_mm)
-    for shift, turn in zip(*random.standard_normal((2, SCREENED, 3)), strict=True):
+def _scattered(pose: Pose, half: Float[np.ndarray, "3"]) -> Iterator[Pose]:
+    """Poses around one: shifted by shares of the half lengths of the model's box (mm) along its axes, and turned."""
+    for shift, turn in zip(*np.random.default_rng(0).standard_normal((2, SCREENED, 3)), strict=True):
         rotation = Rotation.from_rotvec(ROTATION_SD * turn).as_matrix() @ pose.rotation
         yield replace(pose, position=pose.position + pose.rotation.T @ (POSITION_SD * shift * half), rotation=rotation)
 
 
 def _apart(poses: Sequence[Pose], half: Float[np.ndarray, "3"]) -> list[Pose]:
-    """The first ones of those that do not lie close to one before them."""
+    """The first ones of those that do not lie close to one before them, in half lengths (mm) of the model's box."""
     kept: list[Pose] = []
     for pose in poses:
         shifts = [pose.rotation @ (pose.position - other.position) / half for other in kept]

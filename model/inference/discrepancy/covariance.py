@@ -110,6 +110,6 @@ def _root(covariance: Float[np.ndarray, "i i"]) -> Float[np.ndarray, "i i"]:
 
 
 def falls(axis: Float[np.ndarray, "i"], coordinate: Float[np.ndarray, "m"], length: float) -> Float[np.ndarray, "i m"]:
-    """What distance along one axis leaves of a term's variance."""
+    """Share of a term's variance that distances (mm) along one axis leave, for its length (mm)."""
     left = np.exp(-0.5 * np.square((axis[:, None] - coordinate) / length))
     return np.where(left < LEAST_FALL, 0.0, left).astype(np.float32)

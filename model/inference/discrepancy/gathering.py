@@ -11,16 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_array
 
-from model.inference.discrepancy.covariance import Axes, Covariance, falls
+from model.inference.discrepancy.covariance import NEGLIGIBLE, Axes, Covariance, falls
 
 #: Step of a term's lattice, in its lengths.
 LATTICE_SHARE = 0.5
 #: Variance that spreading adds on each axis, in squared steps.
 SPREAD = 0.25
-#: Falls below this are none.
-NEGLIGIBLE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,7 @@ class PointLattice:
     """
 
     axes: Axes
-    shares: csr_matrix
+    shares: csr_array
 
     def gathered(self, weights: Float[np.ndarray, "m"]) -> Float[np.ndarray, "i j k"]:
         """Weights of the points at the nodes."""
@@ -89,6 +87,7 @@ class GatheredPoints:
 
 
 def _lattice(points: Float[np.ndarray, "m 3"], step: float) -> PointLattice:
+    """Points (mm) on a lattice of this step (mm) that holds all nodes next to them."""
     low = points.min(axis=0)
     places = (points - low) / step + 1.0
     nearest = np.rint(places).astype(np.int32)
@@ -100,7 +99,7 @@ def _lattice(points: Float[np.ndarray, "m 3"], step: float) -> PointLattice:
     nodes = (nearest @ strides)[:, None] + offsets @ strides
     ends = np.arange(0, shares.size + 1, shares.shape[1])
     i, j, k = (start + step * (np.arange(count) - 1.0) for start, count in zip(low, shape, strict=True))
-    return PointLattice((i, j, k), csr_matrix((shares.ravel(), nodes.ravel(), ends), (len(points), int(shape.prod()))))
+    return PointLattice((i, j, k), csr_array((shares.ravel(), nodes.ravel(), ends), (len(points), int(shape.prod()))))
 
 
 def _shares(past: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 3"]:

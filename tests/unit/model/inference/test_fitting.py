@@ -17,11 +17,11 @@ from model.inference.fitting import (
     fit,
     fit_from,
     pose_offset,
-    starting_poses,
 )
 from model.inference.objective import Objective
 from model.inference.observations import Observations, Plane
 from model.inference.posterior import fitted_logits
+from model.inference.starts import starting_poses
 from tests.analytic_model import (
     MEAN_AXES,
     SPREAD,

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from model.inference.descent import descend
-from model.inference.fitting import FitOptions, fit, starting_poses
+from model.inference.fitting import FitOptions, fit
 from model.inference.leave_out import contradicting_plane, leave_out_gains, most_wrong
 from model.inference.mask_stack import Plane, section_of
 from model.inference.objective import LinearPrior, Objective, Place, reweighted
+from model.inference.starts import starting_poses
 from tests.analytic_model import ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import ORTHOGONAL, PARALLEL, cube_around, drawn, observed, rotation

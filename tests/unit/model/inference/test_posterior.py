@@ -11,7 +11,7 @@ from scipy.special import expit
 from scipy.stats import norm
 
 from model.geometry import POSE_SIZE, Pose
-from model.inference.fitting import Fit, FitOptions, FitStatus, fit, starting_poses
+from model.inference.fitting import Fit, FitOptions, FitStatus, fit
 from model.inference.objective import Objective
 from model.inference.posterior import (
     CHUNK,
@@ -23,6 +23,7 @@ from model.inference.posterior import (
     normal_displacements,
     parameter_draws,
 )
+from model.inference.starts import starting_poses
 from tests.analytic_model import bent_model, ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import cube_around, drawn, observed, rotation

@@ -9,13 +9,15 @@ from hypothesis import strategies as st
 
 from model.bundle import open_bundle
 from model.geometry import Pose
-from model.inference.fitting import FitOptions, fit, starting_poses
+from model.inference.fitting import FitOptions, fit, fit_from
 from model.inference.observations import Observations, Plane
 from model.inference.screening import APART, KEPT, screened_poses
+from model.inference.starts import starting_poses
 from tests.analytic_model import bent_model
 from tests.drawn_shapes import rotation
 
 BENT = bent_model()
+PLAIN = FitOptions(robust=False)
 HALF = np.asarray(BENT.manifest.half_extent_mm)
 
 
@@ -58,7 +60,7 @@ def test_the_best_place_is_close_to_where_the_shape_lies():
 @given(st.integers(0, 50))
 @settings(max_examples=20)
 def test_places_lie_apart(seed):
-    poses = screened_poses(BENT, sections_of(BENT, 2, seed, step=2.0), Pose(), 0.3, seed)
+    poses = screened_poses(BENT, sections_of(BENT, 2, seed, step=2.0), Pose(), 0.3)
     assert 1 <= len(poses) <= KEPT
     for number, pose in enumerate(poses):
         for other in poses[:number]:
@@ -75,24 +77,27 @@ def test_a_turned_drawing_has_turned_starts():
         np.testing.assert_allclose(there.rotation, here.rotation @ turn.T, atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", [0, 2, 4, 10, 13, 16])
-def test_a_mean_shape_on_two_planes_is_found(shipped_bundles, seed):
-    """From the centroid of such sections of a talus, fits end up to 20 mm away."""
-    (talus,) = (bundle for bundle in shipped_bundles if bundle.name == "talus")
-    model = open_bundle(talus, threads=1)
-    observations = sections_of(model, 2, seed)
-    found = fit(model, observations, FitOptions())
-    assert np.linalg.norm(found.pose.position) < 1.0
-    assert np.linalg.norm(starting_poses(observations, FitOptions())[0].position) > 1.0
+@pytest.fixture(scope="module")
+def talus(shipped_bundles):
+    (bundle,) = (bundle for bundle in shipped_bundles if bundle.name == "talus")
+    return open_bundle(bundle, threads=1)
 
 
-def test_starts_are_looked_for_on_more_planes_when_asked(shipped_bundles):
-    (talus,) = (bundle for bundle in shipped_bundles if bundle.name == "talus")
-    model = open_bundle(talus, threads=1)
-    gains = []
-    for seed in range(6):
-        observations = sections_of(model, 3, seed, step=2.0)
-        usual = fit(model, observations, FitOptions(robust=False))
-        screened = fit(model, observations, FitOptions(robust=False, screened=True))
-        gains.append(usual.objective - screened.objective)
-    assert min(gains) > -0.5
+def distance_from_the_usual_start(model, observations):
+    """How far (mm) from the truth, the origin, a fit ends that starts at the centroid of the drawing."""
+    return np.linalg.norm(fit_from(model, observations, starting_poses(observations, PLAIN)[0], PLAIN).pose.position)
+
+
+@pytest.mark.parametrize("seed", [2, 13, 15, 16, 17, 21, 35])
+def test_a_mean_shape_on_two_planes_is_found(talus, seed):
+    observations = sections_of(talus, 2, seed)
+    assert distance_from_the_usual_start(talus, observations) > 4.0
+    assert np.linalg.norm(fit(talus, observations, PLAIN).pose.position) < 0.5
+
+
+def test_starts_are_looked_for_on_more_planes_when_asked(talus):
+    observations = sections_of(talus, 3, 35, step=2.0)
+    assert distance_from_the_usual_start(talus, observations) > 1.5
+    assert fit(talus, observations, PLAIN).objective > 100.0
+    found = fit(talus, observations, replace(PLAIN, screened=True))
+    assert np.linalg.norm(found.pose.position) < 0.5

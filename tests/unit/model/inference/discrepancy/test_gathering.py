@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from model.inference.discrepancy.covariance import Covariance
 from model.inference.discrepancy.gathering import GatheredPoints
+from tests.analytic_shapes import spread_on_a_ball
 
 COVARIANCE = Covariance((0.5, 0.4), (2.0, 8.0))
 
@@ -21,9 +22,7 @@ def sheet(tilt):
 
 def ball():
     """Points spread evenly on a ball of 11 mm, and areas that differ."""
-    heights = np.linspace(-1.0, 1.0, 1500)
-    around, turn = np.sqrt(1.0 - heights**2), np.pi * (3.0 - 5.0**0.5) * np.arange(1500)
-    points = 11.0 * np.stack([around * np.cos(turn), around * np.sin(turn), heights], axis=1)
+    points = spread_on_a_ball(1500, 11.0)
     return points, 1.0 + 0.4 * np.sin(points @ [0.2, 0.1, -0.3])
 
 

@@ -9,6 +9,7 @@ import pytest
 from model.inference.discrepancy.covariance import Covariance
 from model.inference.discrepancy.grouping import cells_of, means_of
 from model.inference.discrepancy.process import NEAREST, Discrepancy
+from tests.analytic_shapes import spread_on_a_ball
 
 RANDOM = np.random.default_rng(0)
 COVARIANCE = Covariance((0.5, 0.4), (3.0, 9.0))
@@ -23,16 +24,8 @@ PROCESS = Discrepancy(
     half_extent=np.array([16.0, 14.0, 15.0]),
 )
 PLACES = RANDOM.uniform(-11.0, 11.0, (200, 3))
-
-
-def on_a_ball(count):
-    """Places spread evenly on a ball of 11 mm, as close to each other as vertices are."""
-    heights = np.linspace(-1.0, 1.0, count)
-    around, turn = np.sqrt(1.0 - heights**2), np.pi * (3.0 - 5.0**0.5) * np.arange(count)
-    return 11.0 * np.stack([around * np.cos(turn), around * np.sin(turn), heights], axis=1)
-
-
-VERTICES = on_a_ball(1500)
+#: As close to each other as vertices are.
+VERTICES = spread_on_a_ball(1500, 11.0)
 AREAS = 1.0 + 0.4 * np.sin(VERTICES @ [0.2, 0.1, -0.3])
 
 
