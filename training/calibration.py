@@ -18,12 +18,11 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from model.bundle import Manifest, ShapeModel, open_bundle, write_manifest
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_prior, with_discrepancy
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
 from model.inference.fitting import Fit, FitOptions, fit
 from model.inference.observations import Observations, observe
 from model.inference.posterior import (
     fitted_jacobians,
-    fitted_logits,
     laplace_covariance,
     logit_variance,
     mean_probability,
@@ -163,7 +162,7 @@ def with_sound_drawings(model: ShapeModel, cases: Sequence[Case], watch: Watch =
     return replace(
         model.manifest,
         calibration=facts,
-        usual=usual_figures(sound),
+        usual=usual_figures(sound, len(chosen)),
         typical=typical_figures(sound, len(chosen)),
         posterior=posterior_scale(sound),
     )
@@ -181,13 +180,6 @@ def scores(model: ShapeModel, case: Case, regime: Regime) -> Iterator[tuple[Cand
         corrected = seen.corrected(model, DiscrepancyPrior(1.0, fidelity))
         for spread, value in _scores_of(model, corrected, seen.points, seen.truth):
             yield Candidate(model.manifest.likelihood_precision, fidelity, spread), value
-
-
-def wrong_share(model: ShapeModel, case: Case, regime: Regime) -> float:
-    """Share of the voxels near the true surface that the reconstruction of one drawing has on the wrong side."""
-    seen = _fitted(model, case, regime)
-    corrected = seen.corrected(model, discrepancy_prior(model.manifest))
-    return float(np.mean((fitted_logits(model, corrected, seen.points) > 0) != seen.truth))
 
 
 @dataclass(frozen=True)

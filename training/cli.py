@@ -192,7 +192,7 @@ def _parts_for(run: Path, parts: "PriorParts", source: CohortSource, options: Co
         choice = chosen_parts(run, parts, found.validation, watch=lambda: bar.advance(bar.task_ids[0]))
     typer.echo(
         f"{100.0 * choice.parts.least_of_training:g} % of the training's prior stays at least: "
-        f"{100.0 * choice.error:.2f} % of voxels near the surface wrong, {100.0 * choice.trained_error:.2f} % before",
+        f"validation shapes come out {choice.error:.3f} mm off, {choice.trained_error:.3f} mm as trained",
         err=True,
     )
     return choice.parts

@@ -2,9 +2,9 @@
 
 By their density alone, codes of held-out shapes would often have less of it stay than is good for reconstruction: what
 a sparse drawing asks of a code, and what the decoder cannot do, is not seen in codes of dense masks. So the prior that
-is most fitted to the codes is taken of those with which validation shapes are surely reconstructed as well as with the
-model as it was trained, at the likelihood precision that is best for that one: a narrower prior makes up for one that
-is too low, and calibration will find a better.
+is most fitted to the codes is taken of those with which validation shapes surely come out as near to their masks as
+with the model as it was trained, at the likelihood precision that is best for that one: a narrower prior makes up for
+one that is too low, and calibration will find a better.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,12 +16,15 @@ from jaxtyping import Float
 
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
-from training.calibration import PRECISIONS, wrong_share
+from training.calibration import PRECISIONS, with_precision
 from training.cohorts.cohort import Case
 from training.config import Regime
+from training.evaluate import Method, fills_of
+from training.metrics_masks import agreement
 from training.pruning import PriorParts
 from training.release import trial_model
 from training.runs import mask_digest, read_record
+from training.sparsify import for_evaluation
 
 #: Drawings of validation shapes that are reconstructed.
 REGIMES: tuple[Regime, ...] = ("thin", "orthogonal")
@@ -42,7 +45,7 @@ class Choice:
 
     Attributes:
         parts: of the prior.
-        error: share of voxels near the true surfaces on the wrong side.
+        error: average surface distance of the reconstructions from the masks (mm), mean over cases and drawings.
         trained_error: the same of the model as it was trained.
     """
 
@@ -101,7 +104,7 @@ def _check_unseen(run: Path, cases: Sequence[Case]) -> None:
 def choice_by(
     trained: Float[np.ndarray, "n"], errors: Callable[[PriorParts], Float[np.ndarray, "n"]], parts: PriorParts
 ) -> Choice:
-    """The choice given each case's error (share of wrong voxels) with the trained model and with some parts."""
+    """The choice given each case's error (mm) with the trained model and with some parts."""
     *fitted, as_trained = _by_fitness(parts)
     for candidate in fitted:
         found = errors(candidate)
@@ -129,6 +132,11 @@ def _by_fitness(parts: PriorParts) -> Iterator[PriorParts]:
 def _errors(
     model: ShapeModel, precision: float, cases: Sequence[Case], regimes: Sequence[Regime]
 ) -> Float[np.ndarray, "n"]:
-    """Share of wrong voxels of each case at a likelihood precision (1/mm^2), mean over its drawings."""
-    model = replace(model, manifest=replace(model.manifest, likelihood_precision=precision))
-    return np.array([np.mean([wrong_share(model, case, regime) for regime in regimes]) for case in cases])
+    """Average surface distance (mm) of each case at a likelihood precision (1/mm^2), mean over its drawings."""
+    fill = fills_of(with_precision(model, precision), seed=0)[Method.MODEL]
+
+    def error(case: Case, regime: Regime) -> float:
+        found = fill(for_evaluation(case.mask, case.grid, regime), case.grid)
+        return agreement(case.mask, found, case.grid.spacing).asd_mm
+
+    return np.array([np.mean([error(case, regime) for regime in regimes]) for case in cases])

@@ -2,7 +2,8 @@
 
 Figures of `model.inference.reliability` and `model.inference.typicality`, over drawings of three planes and more:
 largest orthogonal slices, every 8th axial one, and parallel ones across the longest axis. A power of the number of
-planes is fitted to each figure; the highest usual value is that line moved up to a high quantile of the drawings.
+planes is fitted to each figure; the highest usual value is that line moved up to a high quantile of the drawings, or
+where those of a few cases are too few to know it, to the one that Student's prediction of a further case puts there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import t as student
 
 from model.bundle import ShapeModel
 from model.inference.agreement import sections_of as compared
@@ -64,20 +66,26 @@ def sound_answers(model: ShapeModel, cases: Sequence[Case]) -> list[Sound]:
     return [answered(unjudged, case, drawing) for case in cases for drawing in sound_drawings(case)]
 
 
-def usual_figures(sound: Sequence[Sound]) -> dict[str, float]:
-    """`Manifest.usual` of a model."""
+def usual_figures(sound: Sequence[Sound], cases: int) -> dict[str, float]:
+    """`Manifest.usual` of a model, from drawings of so many cases."""
     planes = np.array([one.figures.planes for one in sound], float)
+    freedom = freedom_of(cases)
     return {
-        **_line("misfit", planes, np.array([one.figures.misfit_mm for one in sound])),
-        **_line("surface_sd", planes, np.array([one.figures.surface_sd_mm for one in sound])),
+        **_line("misfit", planes, np.array([one.figures.misfit_mm for one in sound]), freedom),
+        **_line("surface_sd", planes, np.array([one.figures.surface_sd_mm for one in sound]), freedom),
     }
 
 
-def typical_figures(sound: Sequence[Sound], cases: int) -> dict[str, float]:
-    """`Manifest.typical` of a model, from drawings of so many cases.
+def freedom_of(cases: int) -> int:
+    """Degrees of freedom of figures over sound drawings of so many cases.
 
-    Drawings of one case are much alike, so the degrees of freedom are those of two answers a case.
+    Drawings of one case are much alike: those of two answers a case.
     """
+    return max(2 * cases - 1, 3)
+
+
+def typical_figures(sound: Sequence[Sound], cases: int) -> dict[str, float]:
+    """`Manifest.typical` of a model, from drawings of so many cases."""
     planes = np.array([one.figures.planes for one in sound], float)
     across, misfits = np.log(planes / USUAL_PLANES), _logs(np.array([one.figures.misfit_mm for one in sound]))
     exponent = _exponent(across, misfits)
@@ -86,7 +94,7 @@ def typical_figures(sound: Sequence[Sound], cases: int) -> dict[str, float]:
         "density": np.array([one.density for one in sound]),
         "slice": np.concatenate([one.surprises for one in sound]),
     }
-    found = {"freedom": float(max(2 * cases - 1, 3)), "misfit_exponent": round(exponent, 4)}
+    found = {"freedom": float(freedom_of(cases)), "misfit_exponent": round(exponent, 4)}
     for name, values in samples.items():
         found[f"{name}_mean"] = round(float(values.mean()), 4)
         found[f"{name}_sd"] = round(max(LEAST_SD[name], float(values.std(ddof=1))), 4)
@@ -124,12 +132,21 @@ def answered(model: ShapeModel, case: Case, drawing: Sections) -> Sound:
     )
 
 
-def _line(name: str, planes: Float[np.ndarray, "n"], values: Float[np.ndarray, "n"]) -> dict[str, float]:
+def _line(name: str, planes: Float[np.ndarray, "n"], values: Float[np.ndarray, "n"], freedom: int) -> dict[str, float]:
     """Highest usual value at `USUAL_PLANES` and the exponent of the number of planes."""
     across, logs = np.log(planes / USUAL_PLANES), _logs(values)
     exponent = _exponent(across, logs)
-    highest = float(np.exp(np.quantile(logs - exponent * across, USUAL_QUANTILE)))
+    highest = float(np.exp(_upper(logs - exponent * across, freedom)))
     return {f"{name}_mm": round(highest, 4), f"{name}_exponent": round(exponent, 4)}
+
+
+def _upper(values: Float[np.ndarray, "n"], freedom: int) -> float:
+    """What a further value stays below with `USUAL_QUANTILE`: the quantile seen, or the one predicted if higher."""
+    seen = float(np.quantile(values, USUAL_QUANTILE))
+    if len(values) < 2:
+        return seen
+    reach = float(student.ppf(USUAL_QUANTILE, freedom)) * np.sqrt(1.0 + 1.0 / (freedom + 1))
+    return max(seen, float(values.mean() + reach * values.std(ddof=1)))
 
 
 def _logs(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:

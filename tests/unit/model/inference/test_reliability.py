@@ -35,7 +35,7 @@ CASES = [
     for name, axes in (("long", (14.5, 8.5, 7.5)), ("short", (11.5, 9.5, 7.0)))
 ]
 PLAIN = ellipsoid_model()
-USUAL = usual_figures(sound_answers(PLAIN, CASES))
+USUAL = usual_figures(sound_answers(PLAIN, CASES), len(CASES))
 MODEL = replace(PLAIN, manifest=replace(PLAIN.manifest, usual=USUAL))
 FIVE = parallel(CASES[0].mask, GRID)
 
