@@ -19,7 +19,7 @@ from benchmarks.perturbations import DATA
 from model.bundle import ShapeModel, open_bundle
 from model.inference.discrepancy.conditioning import discrepancy_prior, with_discrepancy
 from model.inference.discrepancy.contours import contour_points
-from model.inference.discrepancy.process import REACH_MM
+from model.inference.discrepancy.levels import saturated
 from model.inference.fit_types import Fit, FitOptions
 from model.inference.fitting import fit, refit
 from model.inference.observations import Observations, observe
@@ -65,7 +65,7 @@ def distance(model: ShapeModel, found: Fit, points: Float[np.ndarray, "n 3"]) ->
         seen = process.whitened(canonical)
         covariance += process.covariance.between(canonical, canonical) - seen.T @ seen
         covariance += process.noise_mm**2 * np.eye(len(points))
-    gaps = REACH_MM * np.tanh(gaps / REACH_MM)
+    gaps = saturated(gaps)
     return float(gaps @ np.linalg.solve(covariance, gaps)) / len(points)
 
 

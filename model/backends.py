@@ -1,4 +1,4 @@
-"""What inference needs of a network: the `Decoder` and `Prior` protocols.
+"""What inference needs of a network: the `Decoder`, `Prior` and `Completer` protocols.
 
 ONNX Runtime stands behind them by default, TorchScript when asked for. Batches lead: ``b`` shapes
 (starts, ensemble members, samples) are evaluated in one call, each with its own latent code.
@@ -11,9 +11,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import onnxruntime
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from model.chunks import Array, Network, Workers
+from model.geometry import CanonicalLattice
 
 
 @runtime_checkable
@@ -61,6 +62,17 @@ class Prior(Protocol):
 
     def from_base(self, base: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
         """``z = g^-1(z0)``."""
+        ...
+
+
+@runtime_checkable
+class Completer(Protocol):
+    """A network that completes a drawing on a lattice of the canonical frame."""
+
+    lattice: CanonicalLattice
+
+    def logits(self, drawn: Bool[np.ndarray, "2 i j k"]) -> Float[np.ndarray, "i j k"]:
+        """Occupancy logits of all voxels from those drawn inside (first) and outside (second)."""
         ...
 
 
@@ -127,6 +139,18 @@ class OnnxPrior:
         return value
 
 
+class OnnxCompleter:
+    """A bundle's completion network on ONNX Runtime."""
+
+    def __init__(self, graph: Path, lattice: CanonicalLattice, threads: int | None) -> None:
+        self.lattice = lattice
+        self._session = _session(graph, threads)
+
+    def logits(self, drawn: Bool[np.ndarray, "2 i j k"]) -> Float[np.ndarray, "i j k"]:
+        """See `Completer`."""
+        return np.asarray(_run(self._session, drawn=drawn[None].astype(np.float32))[0][0])
+
+
 def load_onnx(folder: Path, latent_size: int, threads: int | None) -> tuple[Decoder, Prior]:
     """Decoder and prior of a bundle on ONNX Runtime (CPU)."""
     return OnnxDecoder(folder, latent_size, threads), OnnxPrior(folder, latent_size, threads)
@@ -137,6 +161,18 @@ def load_torchscript(folder: Path, latent_size: int, threads: int | None) -> tup
     from model.networks import torchscript
 
     return torchscript.load(folder, latent_size, threads)
+
+
+def onnx_completer(graph: Path, lattice: CanonicalLattice, threads: int | None) -> Completer:
+    """A completion network on ONNX Runtime (CPU)."""
+    return OnnxCompleter(graph, lattice, threads)
+
+
+def torchscript_completer(graph: Path, lattice: CanonicalLattice, threads: int | None) -> Completer:
+    """A completion network on TorchScript; needs the extra ``torch``."""
+    from model.networks import torchscript
+
+    return torchscript.load_completer(graph, lattice, threads)
 
 
 def _fixed_point(step: Any, target: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:

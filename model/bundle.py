@@ -9,8 +9,17 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from model.backends import Decoder, Prior, load_onnx, load_torchscript
+from model.backends import (
+    Completer,
+    Decoder,
+    Prior,
+    load_onnx,
+    load_torchscript,
+    onnx_completer,
+    torchscript_completer,
+)
 from model.errors import BundleCorrupt, BundleIncomplete, BundleTooNew
+from model.geometry import CanonicalLattice
 
 BackendName = Literal["onnx", "torchscript"]
 #: Format of the bundles that this program writes, and the newest that it reads.
@@ -25,6 +34,8 @@ REQUIRED_FILES = (
     "prior_density.onnx",
     "prior_base_jacobian.onnx",
 )
+#: The graph of a completion network, where a bundle has one.
+COMPLETION = "completion"
 #: Suffix of each backend's graphs.
 SUFFIXES: dict[BackendName, str] = {"onnx": ".onnx", "torchscript": ".pt"}
 
@@ -59,6 +70,9 @@ class Manifest:
         licence, attribution: of the weights.
         accuracy: measured figures by regime, for example ``{"thin": {"dice": 0.87, "asd_mm": 0.34}}``.
         files: SHA-256 by file name.
+        completion: of a network that completes drawings (`model.inference.completion`): ``voxels`` and ``step_mm`` of
+            its lattice, ``share`` of its distances beside those of the fitted surface, chosen on validation shapes,
+            and ``training``; empty without one.
         anatomy: code of the structure, by default none: ``value``, ``scheme`` (``SCT`` for SNOMED CT) and ``meaning``.
     """
 
@@ -85,6 +99,7 @@ class Manifest:
     usual: dict[str, float] = field(default_factory=dict)
     posterior: dict[str, float] = field(default_factory=dict)
     typical: dict[str, float] = field(default_factory=dict)
+    completion: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -99,13 +114,19 @@ class Population:
 
 @dataclass(frozen=True)
 class ShapeModel:
-    """A bundle opened for inference. `digest` is the SHA-256 over the manifest, which holds all the others."""
+    """A bundle opened for inference.
+
+    Attributes:
+        digest: SHA-256 over the manifest, which holds all the others.
+        completer: completes drawings; None where the bundle has no such network.
+    """
 
     manifest: Manifest
     digest: str
     population: Population
     decoder: Decoder
     prior: Prior
+    completer: Completer | None = None
 
 
 def open_bundle(folder: Path, *, backend: BackendName = "onnx", threads: int | None = None) -> ShapeModel:
@@ -120,7 +141,27 @@ def open_bundle(folder: Path, *, backend: BackendName = "onnx", threads: int | N
         _check_file(folder / name, expected)
     load = {"onnx": load_onnx, "torchscript": load_torchscript}[backend]
     decoder, prior = load(folder, manifest.latent_size, threads)
-    return ShapeModel(manifest, digest, _read_population(folder / POPULATION), decoder, prior)
+    completer = _completer(folder, manifest, backend, threads)
+    return ShapeModel(manifest, digest, _read_population(folder / POPULATION), decoder, prior, completer)
+
+
+def _completer(folder: Path, manifest: Manifest, backend: BackendName, threads: int | None) -> Completer | None:
+    """The completion network of a bundle, where it has one."""
+    known = manifest.completion
+    if not known:
+        return None
+    graph = folder / f"{COMPLETION}{SUFFIXES[backend]}"
+    if graph.name not in manifest.files:
+        raise BundleIncomplete(f"{MANIFEST} lists no {graph.name}; one written by morphoflow complete is accepted.")
+    try:
+        i, j, k = map(int, known["voxels"])
+        lattice = CanonicalLattice((i, j, k), float(known["step_mm"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise BundleCorrupt(
+            f"{MANIFEST} does not say on which lattice its network completes drawings; one written by morphoflow "
+            "complete is accepted."
+        ) from error
+    return {"onnx": onnx_completer, "torchscript": torchscript_completer}[backend](graph, lattice, threads)
 
 
 def read_manifest(folder: Path) -> tuple[Manifest, str]:

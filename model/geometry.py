@@ -70,6 +70,32 @@ class Grid:
 
 
 @dataclass(frozen=True)
+class CanonicalLattice:
+    """Voxels of a canonical frame, around its origin.
+
+    Attributes:
+        voxels: along R, A and S.
+        step_mm: between their centres.
+    """
+
+    voxels: tuple[int, int, int]
+    step_mm: float
+
+    @property
+    def half_mm(self) -> Float[np.ndarray, "3"]:
+        """Half distance between the centres of the first voxel and the last one along each axis."""
+        return 0.5 * self.step_mm * (np.array(self.voxels) - 1.0)
+
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """Centres of all voxels (canonical mm), last axis fastest."""
+        return np.asarray(self.step_mm * np.indices(self.voxels).reshape(3, -1).T - self.half_mm)
+
+    def places(self, canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
+        """Points (canonical mm) in steps of the lattice."""
+        return np.ascontiguousarray(((canonical + self.half_mm) / self.step_mm).T)
+
+
+@dataclass(frozen=True)
 class Pose:
     """Similarity transform from world (RAS mm) to a model's canonical frame (RAS mm).
 

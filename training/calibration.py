@@ -6,6 +6,7 @@ fidelity of the discrepancy). Precision and fidelity are those that leave the fe
 wrong side, the lowest of those that hardly differ; the spread, which moves no surface, is the one with the lowest
 cross-entropy of the posterior mean occupancy there, a proper score. With these, answers to sound drawings tell what is
 usual and typical for the model (`training.usual`) and how wide its SDs have to be (`training.posterior_scale`).
+Of models that have a network to complete drawings, the weight of what it says is chosen by the same error after that.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -18,11 +19,12 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from model.bundle import Manifest, ShapeModel, open_bundle, write_manifest
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_prior, with_discrepancy
 from model.inference.fitting import Fit, FitOptions, fit
 from model.inference.observations import Observations, observe
 from model.inference.posterior import (
     fitted_jacobians,
+    fitted_logits,
     laplace_covariance,
     logit_variance,
     mean_probability,
@@ -40,6 +42,8 @@ from training.usual import sound_answers, typical_figures, usual_figures
 PRECISIONS = (0.1, 0.2, 0.4, 0.8)
 FIDELITIES = (0.15, 0.3, 0.5, 0.7, 0.85)
 SPREADS_MM = (0.2, 0.35, 0.6, 1.0, 1.7)
+#: Weights of a completed drawing beside the fitted surface that are tried.
+SHARES = (0.0, 0.25, 0.5, 0.75)
 REGIMES: tuple[Regime, ...] = ("orthogonal", "thin", "thick")
 #: Voxels this close to the true surface are scored (mm), at most so many of a case.
 BAND_MM = 5.0
@@ -127,8 +131,36 @@ def calibrate_bundle(
     changed = replace(
         model.manifest, likelihood_precision=found.best.precision, discrepancy=discrepancy, calibration=facts
     )
+    if model.completer is not None:
+        changed = with_share(replace(model, manifest=changed), cohort.validation)
     write_manifest(with_sound_drawings(replace(model, manifest=changed), cohort.validation, watch), folder)
     return found
+
+
+def with_share(model: ShapeModel, cases: Sequence[Case]) -> Manifest:
+    """The manifest with the weight of completed drawings that leaves the fewest voxels on the wrong side."""
+    chosen = cases[:: -(-len(cases) // JUDGED_CASES)]
+    manifests = {share: _shared(model.manifest, share) for share in SHARES}
+    errors = {
+        share: float(
+            np.mean([wrong_share(replace(model, manifest=manifest), c, regime) for c in chosen for regime in REGIMES])
+        )
+        for share, manifest in manifests.items()
+    }
+    best = min(share for share in SHARES if errors[share] <= (1.0 + TIE) * min(errors.values()))
+    facts = {**model.manifest.calibration, "error_by_share": {f"{share:g}": error for share, error in errors.items()}}
+    return replace(manifests[best], calibration=facts)
+
+
+def _shared(manifest: Manifest, share: float) -> Manifest:
+    return replace(manifest, completion={**manifest.completion, "share": share})
+
+
+def wrong_share(model: ShapeModel, case: Case, regime: Regime) -> float:
+    """Share of the voxels near the true surface that the reconstruction of one drawing has on the wrong side."""
+    seen = _fitted(model, case, regime)
+    corrected = seen.corrected(model, discrepancy_prior(model.manifest))
+    return float(np.mean((fitted_logits(model, corrected, seen.points) > 0) != seen.truth))
 
 
 def calibrate_bundle_as(folder: Path, known: Manifest, cohort: Cohort, *, threads: int | None = None) -> None:

@@ -20,6 +20,7 @@ from training.choices import (
     RegimeName,
     SplitName,
     configured,
+    resolved,
     with_batches,
     with_duration,
     with_patience,
@@ -47,6 +48,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands to an application."""
     app.command("train")(train)
     app.command("export")(export)
+    app.command("complete")(complete)
     app.command("calibrate")(calibrate)
     app.command("evaluate")(evaluate)
     app.command("sweep")(sweep)
@@ -213,6 +215,39 @@ def anatomy_code(words: str | None) -> dict[str, str]:
 
 
 @takes_cohort
+def complete(
+    source: CohortSource,
+    options: CohortOptions,
+    bundle: Annotated[Path, typer.Argument(help="Folder of an exported bundle; the network is put into it.")],
+    run: Annotated[Path | None, typer.Option(help="Folder of the checkpoint, from which training goes on.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps.")] = None,
+    device: Annotated[DeviceName, typer.Option(help="Where to compute.")] = DeviceName.AUTO,
+    as_json: JsonOption = False,
+) -> None:
+    """Train a network that completes drawings, for a model of many shapes, and put it into its bundle."""
+    with exit_status():
+        from training.completion.release import complete_bundle
+        from training.completion.trainer import STEPS
+
+        found = open_cohort(source, options)
+        tell_findings(found)
+        folder = run or Path("runs") / f"{found.name}-completion"
+        with progress(steps or STEPS, f"learning to complete {found.name}") as bar:
+            config = complete_bundle(
+                bundle,
+                found,
+                folder,
+                steps=steps,
+                seed=options.seed,
+                device=resolved(device),
+                watch=lambda step, loss: bar.update(bar.task_ids[0], completed=step),
+            )
+        summary = {"bundle": str(bundle), "voxels": list(config.voxels), "step_mm": config.step_mm}
+        words = f"{config.voxels} voxels of {config.step_mm:g} mm; {bundle} is to be calibrated anew"
+        typer.echo(json.dumps(summary) if as_json else words)
+
+
+@takes_cohort
 def calibrate(
     source: CohortSource,
     options: CohortOptions,
@@ -238,9 +273,14 @@ def calibrate(
             "error_by_precision_and_fidelity": chosen.errors(),
             "cross_entropy_by_spread": chosen.cross_entropies(),
         }
+        completion = read_manifest(bundle)[0].completion
+        if completion:
+            summary["completion_share"] = completion["share"]
+        counted = f", completed drawings count {completion['share']:g}" if completion else ""
         words = (
             f"likelihood precision {best.precision:g} per mm^2, fidelity {best.fidelity:g}, "
             f"spread {best.spread_mm:g} mm ({100.0 * chosen.scores[best].error:.2f} % of voxels near the surface wrong)"
+            + counted
         )
         typer.echo(json.dumps(summary) if as_json else words)
 

@@ -1,10 +1,7 @@
 """A finished run as a bundle: graphs, statistics of the training codes, and a manifest."""
 
 import hashlib
-import logging
-import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +13,7 @@ from jaxtyping import Float
 from model.bundle import POPULATION, Manifest, Population, ShapeModel, write_manifest
 from model.errors import InvalidParameter
 from model.networks.decoder import OccupancyDecoder
-from model.networks.export import export_graphs, torch_networks
+from model.networks.export import export_graphs, quiet_exporter, torch_networks
 from model.networks.prior import LatentPrior
 from training.autodecoder import AutoDecoder, is_ended
 from training.config import TrainingConfig
@@ -55,7 +52,7 @@ def export_run(
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
     found = assembled(run, parts)
     output.mkdir(parents=True, exist_ok=True)
-    with _quiet_exporter():
+    with quiet_exporter():
         files = export_graphs(found.decoder, found.prior, output)
     np.savez(output / POPULATION, **asdict(found.population()))
     manifest = replace(
@@ -146,22 +143,6 @@ def assembled(run: Path, parts: PriorParts | None) -> Assembled:
         return Assembled(config, record, module.decoder, module.prior, module.code_means(), None)
     less = refitted(module, len(record["train"]), record["half_extent_mm"], parts)
     return Assembled(config, record, less.decoder, less.prior, less.codes, less)
-
-
-@contextmanager
-def _quiet_exporter() -> Iterator[None]:
-    """Keep the exporter's remarks on its own inner workings from the caller."""
-    talkers = [logging.getLogger(name) for name in ("onnxscript", "onnx_ir")]
-    levels = [talker.level for talker in talkers]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for talker in talkers:
-            talker.setLevel(logging.ERROR)
-        try:
-            yield
-        finally:
-            for talker, level in zip(talkers, levels, strict=True):
-                talker.setLevel(level)
 
 
 def load_module(run: Path, config: TrainingConfig, shapes: int) -> AutoDecoder:

@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from model.bundle import ShapeModel
-from model.inference.discrepancy.process import REACH_MM
 from model.inference.fitting import Fit, pose_offset
 from model.inference.mesh import Mesh
 from model.inference.posterior import FieldDerivatives, fitted_jacobians, model_logits, normal_displacements
@@ -52,10 +51,11 @@ def _field_changes(
     everyone = (found, *members)
     logits = np.stack([model_logits(model, one, points) for one in everyone], axis=1).astype(float)
     if found.discrepancy is not None:
-        scale = REACH_MM * found.discrepancy.slope
+        canonical = found.pose.to_canonical(points)
         residuals = np.stack([one.discrepancy.residuals for one in everyone if one.discrepancy is not None], axis=1)
-        means = found.discrepancy.means_of(residuals, found.pose.to_canonical(points))
-        logits = scale * np.tanh(logits / scale) + found.discrepancy.slope * means
+        means = found.discrepancy.means_of(residuals, canonical)
+        levels = np.stack([found.discrepancy.levels.at(column, canonical) for column in logits.T], axis=1)
+        logits = found.discrepancy.slope * (levels + means)
     return np.asarray(logits[:, 1:] - logits[:, :1])
 
 

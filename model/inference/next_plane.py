@@ -20,7 +20,7 @@ from model.bundle import ShapeModel
 from model.errors import InvalidParameter
 from model.geometry import Grid
 from model.inference.discrepancy.conditioning import CELL_MM
-from model.inference.discrepancy.process import REACH_MM, Discrepancy
+from model.inference.discrepancy.process import Discrepancy
 from model.inference.fitting import Fit
 from model.inference.mask_stack import Plane
 from model.inference.mesh import Mesh, vertex_areas
@@ -242,8 +242,10 @@ class Judge:
         found = self._found
         if found.discrepancy is None:
             return np.ones(len(vertices))
-        logits = self._model.decoder.logits(found.latent[None], found.pose.to_canonical(vertices)[None])[0]
-        return found.discrepancy.shrinkage(logits)
+        canonical = found.pose.to_canonical(vertices)
+        return found.discrepancy.shrinkage(
+            self._model.decoder.logits(found.latent[None], canonical[None])[0], canonical
+        )
 
     def _places(self, points: Float[np.ndarray, "m 3"]) -> _Places:
         found = self._found
@@ -257,8 +259,7 @@ class Judge:
         if discrepancy is None:
             none = np.zeros_like(by_parameter)
             return _Places(by_parameter, steepness, none, none, np.zeros((0, len(points))), canonical)
-        levels = np.tanh(logits / (REACH_MM * discrepancy.slope))
-        moved = by_parameter * ((1.0 - np.square(levels)) / discrepancy.slope)[:, None]
+        moved = by_parameter * discrepancy.levels.by_logit(logits, canonical)[:, None]
         return _Places(
             by_parameter,
             steepness,

@@ -11,8 +11,10 @@ Graphs (batch ``b`` and points ``n`` dynamic, float32):
 """
 
 import logging
+import warnings
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -186,10 +188,26 @@ def export_graphs(decoder: OccupancyDecoder, prior: LatentPrior, folder: Path) -
         written.append(f"{spec.name}.onnx")
         if spec.scripted is not None:
             torch.jit.save(_scripted(spec.scripted, spec, size, extent), folder / f"{spec.name}.pt")
-            _leave_out_source_places(folder / f"{spec.name}.pt")
+            leave_out_source_places(folder / f"{spec.name}.pt")
             written.append(f"{spec.name}.pt")
         check_parity(spec, folder, size, extent)
     return written
+
+
+@contextmanager
+def quiet_exporter() -> Iterator[None]:
+    """Keep the exporter's remarks on its own inner workings from the caller."""
+    talkers = [logging.getLogger(name) for name in ("onnxscript", "onnx_ir")]
+    levels = [talker.level for talker in talkers]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for talker in talkers:
+            talker.setLevel(logging.ERROR)
+        try:
+            yield
+        finally:
+            for talker, level in zip(talkers, levels, strict=True):
+                talker.setLevel(level)
 
 
 def _flattened(spec: GraphSpec, size: int, extent: float) -> nn.Module:
@@ -218,7 +236,7 @@ def _scripted(module: nn.Module, spec: GraphSpec, size: int, extent: float) -> t
     return traced
 
 
-def _leave_out_source_places(path: Path) -> None:
+def leave_out_source_places(path: Path) -> None:
     """Rewrite a TorchScript archive without its debug records, which name folders of the exporting machine."""
     with zipfile.ZipFile(path) as archive:
         kept = {name: archive.read(name) for name in archive.namelist() if not name.endswith(".debug_pkl")}
@@ -238,10 +256,10 @@ def check_parity(spec: GraphSpec, folder: Path, size: int, extent: float) -> Non
         example = spec.example(size, extent, batch, points, seed=batch)
         expected = _as_arrays(spec.module(*example))
         feeds = {name: value.numpy() for name, value in zip(spec.inputs, example, strict=True)}
-        _compare(spec.name, "ONNX Runtime", expected, session.run(None, feeds))
+        compare(spec.name, "ONNX Runtime", expected, session.run(None, feeds))
         if spec.scripted is not None:
             scripted = torch.jit.load(folder / f"{spec.name}.pt")
-            _compare(spec.name, "TorchScript", _as_arrays(spec.scripted(*example)), _as_arrays(scripted(*example)))
+            compare(spec.name, "TorchScript", _as_arrays(spec.scripted(*example)), _as_arrays(scripted(*example)))
 
 
 def _as_arrays(outputs: Tensor | Sequence[Tensor]) -> list[np.ndarray]:
@@ -249,7 +267,12 @@ def _as_arrays(outputs: Tensor | Sequence[Tensor]) -> list[np.ndarray]:
     return [value.detach().numpy() for value in sequence]
 
 
-def _compare(name: str, runtime: str, expected: Sequence[np.ndarray], found: Sequence[np.ndarray]) -> None:
+def compare(name: str, runtime: str, expected: Sequence[np.ndarray], found: Sequence[np.ndarray]) -> None:
+    """Whether a runtime's outputs are the network's.
+
+    Raises:
+        ParityError: they differ by more than `PARITY_TOLERANCE`.
+    """
     for number, (a, b) in enumerate(zip(expected, found, strict=True)):
         gap = float(np.abs(a - b).max() / max(1.0, np.abs(a).max()))
         if not gap <= PARITY_TOLERANCE:

@@ -1,4 +1,4 @@
-"""Decoder and prior on torch: from TorchScript, the second implementation behind `model.backends`, or from modules."""
+"""Networks on torch: from TorchScript, the second implementation behind `model.backends`, or from modules."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+
+from model.geometry import CanonicalLattice
 
 #: A graph as `model.networks.export` names it.
 Graph = Callable[..., Any]
@@ -81,6 +83,19 @@ class TorchPrior:
         return _array(value)
 
 
+class TorchCompleter:
+    """A completion network by its graph; see `model.backends.Completer`."""
+
+    def __init__(self, graph: Graph, lattice: CanonicalLattice) -> None:
+        self.lattice = lattice
+        self._graph = graph
+
+    def logits(self, drawn: Bool[np.ndarray, "2 i j k"]) -> Float[np.ndarray, "i j k"]:
+        """See `model.backends.Completer`."""
+        with torch.no_grad():
+            return _array(self._graph(_tensor(drawn[None]))[0])
+
+
 def load(folder: Path, latent_size: int, threads: int | None) -> tuple[TorchDecoder, TorchPrior]:
     """Decoder and prior of a bundle."""
     if threads:
@@ -93,7 +108,14 @@ def load(folder: Path, latent_size: int, threads: int | None) -> tuple[TorchDeco
     return TorchDecoder(latent_size, logits, jacobians), TorchPrior(latent_size, density, steps)
 
 
-def _tensor(values: Float[np.ndarray, "..."]) -> Tensor:
+def load_completer(graph: Path, lattice: CanonicalLattice, threads: int | None) -> TorchCompleter:
+    """Completion network of a bundle."""
+    if threads:
+        torch.set_num_threads(threads)
+    return TorchCompleter(torch.jit.load(graph), lattice)
+
+
+def _tensor(values: Float[np.ndarray, "..."] | Bool[np.ndarray, "..."]) -> Tensor:
     return torch.from_numpy(np.array(values, dtype=np.float32, order="C"))
 
 

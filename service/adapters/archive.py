@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from model.geometry import Grid, Pose
+from model.geometry import CanonicalLattice, Grid, Pose
 from model.inference.calipers import Extent
+from model.inference.completion.field import Completion
 from model.inference.discrepancy.covariance import Covariance
+from model.inference.discrepancy.levels import Levels
 from model.inference.discrepancy.process import Discrepancy
 from model.inference.estimates import Estimate
 from model.inference.fitting import Fit, FitStatus
@@ -153,7 +155,27 @@ def _state_arrays(state: ShapeState) -> dict[str, np.ndarray]:
         arrays |= {
             f"discrepancy_{number}_{name}": values for name, values in _discrepancy_arrays(fit.discrepancy).items()
         }
+    arrays |= _completion_arrays(state)
     return arrays if state.covariance is None else {**arrays, "covariance": state.covariance}
+
+
+def _completion_arrays(state: ShapeState) -> dict[str, np.ndarray]:
+    """What a network made of the drawing; members of an ensemble have it in common."""
+    discrepancy = state.fits[0].discrepancy
+    completion = None if discrepancy is None else discrepancy.levels.completion
+    if completion is None:
+        return {}
+    scales = np.array([completion.lattice.step_mm, completion.share])
+    return {"completion_distances": completion.distances, "completion_scales": scales}
+
+
+def _completion(arrays: Mapping[str, np.ndarray]) -> Completion | None:
+    if "completion_distances" not in arrays:
+        return None
+    distances = arrays["completion_distances"]
+    step, share = map(float, arrays["completion_scales"])
+    i, j, k = distances.shape
+    return Completion(CanonicalLattice((i, j, k), step), distances, share)
 
 
 def _discrepancy_arrays(discrepancy: Discrepancy | None) -> dict[str, np.ndarray]:
@@ -169,7 +191,7 @@ def _discrepancy_arrays(discrepancy: Discrepancy | None) -> dict[str, np.ndarray
     }
 
 
-def _discrepancy(arrays: Mapping[str, np.ndarray], number: int) -> Discrepancy | None:
+def _discrepancy(arrays: Mapping[str, np.ndarray], number: int, completion: Completion | None) -> Discrepancy | None:
     prefix = f"discrepancy_{number}_"
     found = {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
     if not found:
@@ -177,10 +199,12 @@ def _discrepancy(arrays: Mapping[str, np.ndarray], number: int) -> Discrepancy |
     sds, lengths = (tuple(map(float, row)) for row in found["terms"])
     noise, slope = map(float, found["scales"])
     places = found["points"], found["residuals"], found["jacobian"]
-    return Discrepancy(*places, Covariance(sds, lengths), noise, slope, found["half_extent"])
+    levels = Levels(slope, completion)
+    return Discrepancy(*places, Covariance(sds, lengths), noise, levels, found["half_extent"])
 
 
 def _state(arrays: dict[str, np.ndarray], documents: list[dict[str, Any]]) -> ShapeState:
+    completion = _completion(arrays)
     fits = tuple(
         Fit(
             latent=arrays["latent"][i],
@@ -190,7 +214,7 @@ def _state(arrays: dict[str, np.ndarray], documents: list[dict[str, Any]]) -> Sh
             iterations=document["iterations"],
             objective=document["objective"],
             precision=arrays["precision"][i],
-            discrepancy=_discrepancy(arrays, i),
+            discrepancy=_discrepancy(arrays, i, completion),
         )
         for i, document in enumerate(documents)
     )

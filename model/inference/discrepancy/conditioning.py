@@ -8,10 +8,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from model.bundle import Manifest, ShapeModel
+from model.inference.completion.completing import completed
 from model.inference.discrepancy.contours import contour_points
 from model.inference.discrepancy.covariance import Covariance
 from model.inference.discrepancy.grouping import cells_of, means_of
-from model.inference.discrepancy.process import REACH_MM, Discrepancy
+from model.inference.discrepancy.levels import Levels, saturated
+from model.inference.discrepancy.process import Discrepancy
 from model.inference.fitting import Fit
 from model.inference.mask_stack import MaskStack
 from model.inference.objective import Place
@@ -100,15 +102,15 @@ def discrepancy_of(
         part[0] for part in model.decoder.logits_and_jacobians(found.latent[None], canonical[None])
     )
     slope = float(np.median(np.linalg.norm(by_point, axis=1)))
-    levels = np.tanh(logits / (REACH_MM * slope))
+    levels = Levels(slope, completed(model, found, stacks, observations))
     by_parameter = np.concatenate([by_latent, found.pose.jacobian(canonical, by_point)], axis=1)
     return Discrepancy(
         points=canonical,
-        residuals=REACH_MM * (np.tanh(seen.distances / REACH_MM) - levels),
-        jacobian=by_parameter * ((1.0 - np.square(levels)) / slope)[:, None],
+        residuals=saturated(seen.distances) - levels.at(logits, canonical),
+        jacobian=by_parameter * levels.by_logit(logits, canonical)[:, None],
         covariance=prior.covariance,
         noise_mm=prior.noise_mm,
-        slope=slope,
+        levels=levels,
         half_extent=canonical_box(model),
     )
 
@@ -121,7 +123,7 @@ def observed_anew(model: ShapeModel, found: Fit, places: Sequence[Place]) -> lis
     world = found.pose.to_world(made.points)
     points = np.stack([made.points, *(place.pose.to_canonical(world) for place in places)])
     logits = model.decoder.logits(np.stack([found.latent, *(place.latent for place in places)]), points)
-    levels = REACH_MM * np.tanh(logits / (REACH_MM * made.slope))
+    levels = [made.levels.at(row, there) for row, there in zip(logits, points, strict=True)]
     return [
         replace(made, points=there, residuals=made.residuals + levels[0] - level)
         for there, level in zip(points[1:], levels[1:], strict=True)

@@ -1,10 +1,10 @@
 """What the drawn contours show and the latent code cannot express: a Gaussian process added to the fitted field.
 
-Near the surface the fitted logit ``l`` tells how far (mm) a point is from it: ``m = C tanh(l / (C g))`` with ``g`` the
-field's slope there (1/mm) and ``C`` a distance beyond which nothing more is said. The field that is reconstructed is
+The field that is reconstructed is
 
     F(u) = g (m(u) + delta(u)),     delta ~ GP(0, k),     m(c) + delta(c) = 0 + noise at drawn contour points c,
 
+with ``m`` the distance from the fitted surface and ``g`` its slope there (`model.inference.discrepancy.levels`),
 so that its surface runs through the drawn contours to within the annotator's noise and is the model's own away from
 them (a discrepancy in the sense of Kennedy and O'Hagan, 2001). All in the canonical frame.
 """
@@ -23,9 +23,8 @@ from scipy.spatial import cKDTree
 from model.inference.discrepancy.covariance import Axes, Covariance
 from model.inference.discrepancy.gathering import GatheredPoints
 from model.inference.discrepancy.grouping import cells_of, means_of
+from model.inference.discrepancy.levels import Levels
 
-#: ``C``: distances from the surface count up to about this (mm).
-REACH_MM = 3.0
 #: Steps of the lattice that holds the process, of its shortest length.
 LATTICE_STEPS = 1.75
 #: Step of the differences that give the gradient (mm).
@@ -50,7 +49,7 @@ class Discrepancy:
         jacobian: (n, p) derivatives of ``m`` by (latent, pose step) there.
         covariance: of the process before it saw the contours (mm^2).
         noise_mm: SD of the observations.
-        slope: ``g`` (1/mm).
+        levels: ``m``.
         half_extent: half size of the canonical box in which the process is known (mm).
     """
 
@@ -59,29 +58,29 @@ class Discrepancy:
     jacobian: Float[np.ndarray, "n p"]
     covariance: Covariance
     noise_mm: float
-    slope: float
+    levels: Levels
     half_extent: Float[np.ndarray, "3"]
+
+    @property
+    def slope(self) -> float:
+        """``g`` (1/mm)."""
+        return self.levels.slope
 
     def corrected(self, logits: Float[np.ndarray, "m"], canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
         """``F`` where the decoder gives these logits."""
-        return self.levels(logits) + self.slope * self.mean(canonical)
-
-    def levels(self, logits: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-        """``g m``."""
-        scale = REACH_MM * self.slope
-        return np.asarray(scale * np.tanh(logits / scale))
+        return np.asarray(self.slope * (self.levels.at(logits, canonical) + self.mean(canonical)))
 
     def corrected_with_gradient(
         self, logits: Float[np.ndarray, "m"], by_point: Float[np.ndarray, "m 3"], canonical: Float[np.ndarray, "m 3"]
     ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 3"]]:
         """``F`` and its gradient (1/mm) where the decoder gives these logits and derivatives by canonical point."""
         mean, slopes = self.mean_and_gradient(canonical)
-        gradient = self.shrinkage(logits)[:, None] * by_point + self.slope * slopes
-        return self.levels(logits) + self.slope * mean, gradient
+        value = self.levels.at(logits, canonical) + mean
+        return self.slope * value, self.slope * (self.levels.gradient(logits, by_point, canonical) + slopes)
 
-    def shrinkage(self, logits: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+    def shrinkage(self, logits: Float[np.ndarray, "m"], canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
         """Derivative of ``g m`` by the logit."""
-        return np.asarray(1.0 - np.square(np.tanh(logits / (REACH_MM * self.slope))))
+        return self.slope * self.levels.by_logit(logits, canonical)
 
     def mean(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
         """Posterior mean (mm); 0 outside the box."""

@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 
 import nibabel as nib
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from model.bundle import open_bundle
+from model.bundle import open_bundle, read_manifest
+from training.calibration import SHARES
 from training.choices import DeviceName, ObjectiveName, RegimeName, configured, with_batches, with_duration
 from training.cli import register
 from training.cohorts import CohortOptions
@@ -207,7 +209,7 @@ class TestExport:
         words = ("export", bundle.parent / "run", "--output", tmp_path / "out", "--masks", bundle.parent / "masks")
         result = run(*words)
         assert result.exit_code == 0, result.stderr
-        assert "of voxels near the surface wrong" in result.stderr
+        assert "validation shapes come out" in result.stderr
         fitted = open_bundle(tmp_path / "out").manifest.training["pruned"]["fitted"]
         assert fitted["least_of_training"] in (0.5, 1.0)
 
@@ -236,6 +238,59 @@ class TestExport:
 
     def test_a_folder_without_a_run_is_refused(self, run, tmp_path):
         assert run("export", tmp_path, "--output", tmp_path / "out").exit_code == 2
+
+
+@pytest.fixture(scope="module")
+def completed(tmp_path_factory, run, bundle):
+    folder = tmp_path_factory.mktemp("completed")
+    shutil.copytree(bundle, folder / "bundle")
+    words = ("complete", folder / "bundle", "--masks", bundle.parent / "masks", "--steps", 20, "--run", folder / "run")
+    result = run(*words, "--device", "cpu", "--json")
+    assert result.exit_code == 0, result.stderr
+    return folder, json.loads(result.stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+class TestComplete:
+    def test_the_bundle_has_the_network_and_says_what_it_was_trained_on(self, completed):
+        folder, told = completed
+        manifest, _ = read_manifest(folder / "bundle")
+        assert told["voxels"] == manifest.completion["voxels"]
+        assert (manifest.completion["training"]["shapes"], manifest.completion["training"]["steps"]) == (5, 20)
+        assert {"completion.onnx", "completion.pt"} <= manifest.files.keys()
+        assert open_bundle(folder / "bundle").completer.lattice.voxels == tuple(told["voxels"])
+        assert "/" not in json.dumps(manifest.completion)
+
+    def test_a_finished_training_is_taken_as_it_is(self, completed, run, bundle, tmp_path):
+        folder, _ = completed
+        other = shutil.copytree(bundle, tmp_path / "other")
+        words = ("complete", other, "--masks", bundle.parent / "masks", "--steps", 20, "--run", folder / "run")
+        assert run(*words, "--device", "cpu").exit_code == 0
+        assert (other / "completion.onnx").read_bytes() == (folder / "bundle" / "completion.onnx").read_bytes()
+
+    def test_calibration_chooses_its_weight_by_validation_shapes(self, completed, run, bundle, tmp_path):
+        folder = shutil.copytree(completed[0] / "bundle", tmp_path / "calibrated")
+        result = run("calibrate", folder, "--masks", bundle.parent / "masks", "--json")
+        assert result.exit_code == 0, result.stderr
+        manifest, _ = read_manifest(folder)
+        errors, share = manifest.calibration["error_by_share"], manifest.completion["share"]
+        assert [float(tried) for tried in errors] == list(SHARES)
+        assert errors[f"{share:g}"] <= 1.005 * min(errors.values())
+        assert json.loads(result.stdout)["completion_share"] == share
+
+    def test_a_model_without_one_has_no_weight_to_choose(self, run, bundle, tmp_path):
+        plain = shutil.copytree(bundle, tmp_path / "plain")
+        result = run("calibrate", plain, "--masks", bundle.parent / "masks", "--json")
+        assert result.exit_code == 0, result.stderr
+        assert read_manifest(plain)[0].completion == {}
+        assert "completion_share" not in json.loads(result.stdout)
+
+    def test_a_folder_without_a_bundle_is_refused_before_anything_is_trained(self, run, masks, tmp_path):
+        result = run("complete", tmp_path, "--masks", masks, "--run", tmp_path / "run", "--steps", 5)
+        assert result.exit_code != 0
+        assert "has no manifest.json" in result.stderr
+        assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow

@@ -8,10 +8,15 @@ import time
 import numpy as np
 import pytest
 
+from model.inference.mask_stack import MaskStack
+from model.inference.reconstruction import Options, reconstruct
+from model.inference.uncertainty import occupancy
 from service.adapters.archive import MESH, STATE, SUMMARY
 from service.adapters.result_store import DiskResultStore
 from service.errors import StoreFull, UnknownResult
-from tests.service_parts import outcome_of
+from tests.analytic_model import ellipsoid_model
+from tests.completing import BallCompleter, completing
+from tests.service_parts import outcome_of, sparse_ellipsoid
 
 
 class Clock:
@@ -57,6 +62,18 @@ def test_what_is_kept_comes_back_exactly(store, uncertain):
     kept = store.save(outcome)
     assert_same(store.load(kept.id), kept)
     assert_same(kept.outcome, outcome)
+
+
+@pytest.mark.parametrize("uncertainty", ["laplace", "ensemble"])
+def test_a_field_that_was_completed_and_follows_its_contours_comes_back_exactly(store, uncertainty):
+    model = completing(ellipsoid_model(), BallCompleter(9.0), 0.5)
+    values, grid = sparse_ellipsoid()
+    stack = MaskStack("mask[0]", grid, values > 0, np.zeros(values.shape, bool))
+    answer = reconstruct(model, [stack], Options(annotated="auto", uncertainty=uncertainty))
+    kept = store.save(dataclasses.replace(outcome_of(), reconstruction=answer))
+    loaded = store.load(kept.id).outcome.reconstruction
+    assert loaded.state.fits[0].discrepancy.levels.completion is not None
+    np.testing.assert_array_equal(occupancy(model, loaded.state, grid), occupancy(model, answer.state, grid))
 
 
 def test_results_survive_a_restart(store, tmp_path, clock):

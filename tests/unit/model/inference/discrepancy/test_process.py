@@ -8,6 +8,7 @@ import pytest
 
 from model.inference.discrepancy.covariance import Covariance
 from model.inference.discrepancy.grouping import cells_of, means_of
+from model.inference.discrepancy.levels import Levels
 from model.inference.discrepancy.process import NEAREST, Discrepancy
 from tests.analytic_shapes import spread_on_a_ball
 
@@ -20,7 +21,7 @@ PROCESS = Discrepancy(
     jacobian=RANDOM.normal(size=(60, 4)),
     covariance=COVARIANCE,
     noise_mm=0.2,
-    slope=3.0,
+    levels=Levels(3.0),
     half_extent=np.array([16.0, 14.0, 15.0]),
 )
 PLACES = RANDOM.uniform(-11.0, 11.0, (200, 3))
@@ -129,7 +130,7 @@ def test_field_is_the_decoders_where_nothing_was_observed_and_near_its_surface()
 def test_shrinkage_is_the_derivative_by_the_logit():
     logits, far = np.linspace(-20.0, 20.0, 9), np.tile([300.0, 0.0, 0.0], (9, 1))
     change = (PROCESS.corrected(logits + 1e-4, far) - PROCESS.corrected(logits - 1e-4, far)) / 2e-4
-    np.testing.assert_allclose(PROCESS.shrinkage(logits), change, atol=1e-6)
+    np.testing.assert_allclose(PROCESS.shrinkage(logits, far), change, atol=1e-6)
 
 
 def test_cells_hold_their_means_and_keep_kinds_apart():

@@ -1,0 +1,36 @@
+"""What was drawn of a lattice's voxels."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from model.inference.mask_stack import MaskStack, Plane
+
+
+def drawn_at(
+    world: Float[np.ndarray, "n 3"], reach_mm: float, stacks: Sequence[MaskStack], planes: Sequence[Plane]
+) -> Bool[np.ndarray, "2 n"]:
+    """Which points lie on a drawn plane, inside what was drawn there (first row) or outside (second).
+
+    Args:
+        world: points (RAS mm).
+        reach_mm: points this near to a plane lie on it: half a step of their lattice.
+        stacks: the drawing.
+        planes: those that count.
+    """
+    found = np.zeros((2, len(world)), bool)
+    for plane in planes:
+        stack = stacks[plane.stack]
+        across = np.linalg.inv(stack.grid.affine)[plane.axis]
+        gap = (world @ across[:3] + across[3] - plane.index) / np.linalg.norm(across[:3])
+        rows = np.flatnonzero(np.abs(gap) <= reach_mm)
+        voxels = np.rint(stack.grid.to_index(world[rows])).astype(int)
+        voxels[:, plane.axis] = plane.index
+        within = ((voxels >= 0) & (voxels < np.array(stack.grid.shape))).all(axis=1)
+        rows, at = rows[within], tuple(voxels[within].T)
+        seen, inside = ~stack.excluded[at], stack.foreground[at]
+        found[0, rows[seen & inside]] = True
+        found[1, rows[seen & ~inside]] = True
+    found[1] &= ~found[0]
+    return found

@@ -1,0 +1,58 @@
+"""How far a point is from the fitted surface, as far as it counts.
+
+Near the surface the fitted logit ``l`` tells the distance (mm): ``m = C tanh(l / (C g))`` with ``g`` the field's slope
+there (1/mm) and ``C`` a distance beyond which nothing more is said. Where a network has completed the drawing, its
+distance ``c`` counts as well, with weight ``w``: ``(1 - w) m + w c``.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from model.inference.completion.field import Completion
+
+#: ``C``: distances from the surface count up to about this (mm).
+REACH_MM = 3.0
+
+
+def saturated(distances: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
+    """Distances (mm) as far as they count."""
+    return np.asarray(REACH_MM * np.tanh(distances / REACH_MM))
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Distances in the canonical frame by the decoder's logits.
+
+    Attributes:
+        slope: ``g`` (1/mm).
+        completion: what a network made of the drawing; None without.
+    """
+
+    slope: float
+    completion: Completion | None = None
+
+    def at(self, logits: Float[np.ndarray, "n"], canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Distance (mm) at canonical points where the decoder gives these logits."""
+        own = saturated(logits / self.slope)
+        if self.completion is None:
+            return own
+        return np.asarray(own + self.completion.weight(canonical) * (self.completion.distance(canonical) - own))
+
+    def by_logit(self, logits: Float[np.ndarray, "n"], canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Derivative of the distance by the logit (mm)."""
+        own = (1.0 - np.square(np.tanh(logits / (REACH_MM * self.slope)))) / self.slope
+        return np.asarray(own if self.completion is None else own * (1.0 - self.completion.weight(canonical)))
+
+    def gradient(
+        self, logits: Float[np.ndarray, "n"], by_point: Float[np.ndarray, "n 3"], canonical: Float[np.ndarray, "n 3"]
+    ) -> Float[np.ndarray, "n 3"]:
+        """Gradient of the distance where the decoder gives these logits and derivatives by canonical point (1/mm)."""
+        through_logits = self.by_logit(logits, canonical)[:, None] * by_point
+        if self.completion is None:
+            return np.asarray(through_logits)
+        by_weight, by_distance = self.completion.gradients(canonical)
+        more = self.completion.distance(canonical) - saturated(logits / self.slope)
+        weight = self.completion.weight(canonical)
+        return np.asarray(through_logits + more[:, None] * by_weight + weight[:, None] * by_distance)

@@ -1,0 +1,63 @@
+"""A bundle with a completion network, trained for it on a cohort."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from model.bundle import read_manifest, write_manifest
+from model.networks.completion import MULTIPLE
+from model.networks.completion_export import export_completion
+from training.cohorts.cohort import Cohort
+from training.completion.samples import lattice_for, windows_of
+from training.completion.trainer import CompletionConfig, Watch, train_completion
+from training.points import Window
+
+#: Voxels of the lattice at most, and its least step (mm).
+MOST_VOXELS, LEAST_STEP_MM = 110_000, 1.0
+#: Weight of the completion beside the fitted surface before `morphoflow calibrate` has chosen one.
+UNCALIBRATED_SHARE = 0.5
+
+
+def completion_config(cohort: Cohort, windows: Sequence[Window], steps: int | None, seed: int) -> CompletionConfig:
+    """The configuration for a cohort; mirror images are among the samples where both sides are among the masks."""
+    lattice = lattice_for(windows, MOST_VOXELS, LEAST_STEP_MM, MULTIPLE)
+    config = CompletionConfig(
+        lattice.voxels, lattice.step_mm, reflected=cohort.side in ("mixed", "unpaired"), seed=seed
+    )
+    return config if steps is None else replace(config, steps=steps)
+
+
+def complete_bundle(
+    folder: Path,
+    cohort: Cohort,
+    run: Path,
+    *,
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    watch: Watch = lambda step, loss: None,
+) -> CompletionConfig:
+    """Train a network on the cohort's training masks and put it into the bundle, which is to be calibrated anew.
+
+    Args:
+        run: folder of the training's checkpoint, from which it goes on.
+
+    Raises:
+        BundleError: the bundle cannot be trusted.
+        ParityError: the exported graphs disagree with the network.
+    """
+    manifest, _ = read_manifest(folder)
+    windows = windows_of(cohort.train)
+    config = completion_config(cohort, windows, steps, seed)
+    net = train_completion(windows, config, run, device=device, watch=watch)
+    written = export_completion(net, folder)
+    facts = {
+        "voxels": list(config.voxels),
+        "step_mm": config.step_mm,
+        "share": UNCALIBRATED_SHARE,
+        "training": {**asdict(config), "cohort": cohort.name, "shapes": len(cohort.train)},
+    }
+    files = {**manifest.files, **{name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in written}}
+    write_manifest(replace(manifest, completion=facts, files=dict(sorted(files.items()))), folder)
+    return config
