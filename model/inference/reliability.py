@@ -87,7 +87,7 @@ def figures_of(
         spread = _mean_sd(model, judged, mesh.vertices[::step])
     else:
         spread = float(sd_mm[::step].mean())
-    return Figures(_planes_used(found, observations), _misfit(judged), spread)
+    return Figures(_planes_used(found, observations), _misfit(model, judged), spread)
 
 
 def less_trusting(
@@ -131,7 +131,7 @@ def _standing(found: Fit) -> tuple[int, float]:
 
 
 def _is_rough(model: ShapeModel, judged: Fit, observations: Observations) -> bool:
-    return _misfit(judged) > highest_usual(model.manifest.usual, "misfit", _planes_used(judged, observations))
+    return _misfit(model, judged) > highest_usual(model.manifest.usual, "misfit", _planes_used(judged, observations))
 
 
 def _planes_used(found: Fit, observations: Observations) -> int:
@@ -141,9 +141,16 @@ def _planes_used(found: Fit, observations: Observations) -> int:
     return len(np.unique(observations.plane_of[used]))
 
 
-def _misfit(found: Fit) -> float:
-    """RMS (mm) of what its discrepancy was observed to be."""
-    return 0.0 if found.discrepancy is None else float(np.sqrt(np.mean(np.square(found.discrepancy.residuals))))
+def _misfit(model: ShapeModel, found: Fit) -> float:
+    """RMS distance (mm) of the drawn contours from the code's shape, whatever a network makes of the drawing."""
+    seen = found.discrepancy
+    if seen is None:
+        return 0.0
+    residuals = seen.residuals
+    if seen.levels.completion is not None:
+        logits = model.decoder.logits(found.latent[None], seen.points[None])[0]
+        residuals = residuals + seen.levels.at(logits, seen.points) - seen.levels.of_code(logits)
+    return float(np.sqrt(np.mean(np.square(residuals))))
 
 
 def _mean_sd(model: ShapeModel, found: Fit, points: Float[np.ndarray, "v 3"]) -> float:

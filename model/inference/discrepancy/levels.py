@@ -33,9 +33,13 @@ class Levels:
     slope: float
     completion: Completion | None = None
 
+    def of_code(self, logits: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """``m`` (mm): what code and pose alone say."""
+        return saturated(logits / self.slope)
+
     def at(self, logits: Float[np.ndarray, "n"], canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Distance (mm) at canonical points where the decoder gives these logits."""
-        own = saturated(logits / self.slope)
+        own = self.of_code(logits)
         if self.completion is None:
             return own
         return np.asarray(own + self.completion.weight(canonical) * (self.completion.distance(canonical) - own))
@@ -53,6 +57,6 @@ class Levels:
         if self.completion is None:
             return np.asarray(through_logits)
         by_weight, by_distance = self.completion.gradients(canonical)
-        more = self.completion.distance(canonical) - saturated(logits / self.slope)
+        more = self.completion.distance(canonical) - self.of_code(logits)
         weight = self.completion.weight(canonical)
         return np.asarray(through_logits + more[:, None] * by_weight + weight[:, None] * by_distance)

@@ -8,9 +8,11 @@ import trimesh
 
 from model.geometry import Pose
 from model.inference.completion.completing import completed
+from model.inference.discrepancy.conditioning import DiscrepancyPrior
 from model.inference.discrepancy.levels import saturated
 from model.inference.fitting import FitOptions, fit
 from model.inference.reconstruction import Options, reconstruct
+from model.inference.reliability import figures_of
 from tests.analytic_model import ellipsoid_model
 from tests.analytic_shapes import Ellipsoid, sphere
 from tests.completing import LATTICE, BallCompleter, KnownCompleter, completing
@@ -97,6 +99,14 @@ class TestWhatBecomesOfIt:
         assert np.isfinite(sd).all()
         assert (sd > 0).all()
         assert found.volume_ml.low < found.volume_ml.value < found.volume_ml.high
+
+    def test_how_far_the_contours_lie_from_the_codes_shape_does_not_change(self):
+        """The network sees the drawing and follows it, a wrong one too: its answer must not hide that."""
+        model, prior = completing(MODEL, BallCompleter(9.0), 0.75), DiscrepancyPrior(0.6, 0.5)
+        alone, with_network = (
+            figures_of(one, FOUND, [STACK], OBSERVATIONS, answer(MODEL).mesh, prior) for one in (MODEL, model)
+        )
+        assert with_network.misfit_mm == pytest.approx(alone.misfit_mm, rel=1e-6)
 
     def test_trusting_the_model_alone_leaves_the_code(self):
         model = completing(MODEL, BallCompleter(14.0), 0.5)
