@@ -6,7 +6,8 @@ fidelity of the discrepancy). Precision and fidelity are those that leave the fe
 wrong side, the lowest of those that hardly differ; the spread, which moves no surface, is the one with the lowest
 cross-entropy of the posterior mean occupancy there, a proper score. With these, answers to sound drawings tell what is
 usual and typical for the model (`training.usual`) and how wide its SDs have to be (`training.posterior_scale`).
-Of models that have a network to complete drawings, the weight of what it says is chosen by the same error after that.
+Of models that have a network to complete drawings, the weight of what it says is chosen by the same error after that,
+and the spread once more.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -133,6 +134,7 @@ def calibrate_bundle(
     )
     if model.completer is not None:
         changed = with_share(replace(model, manifest=changed), cohort.validation)
+        changed = with_spread(replace(model, manifest=changed), cohort.validation)
     write_manifest(with_sound_drawings(replace(model, manifest=changed), cohort.validation, watch), folder)
     return found
 
@@ -150,6 +152,22 @@ def with_share(model: ShapeModel, cases: Sequence[Case]) -> Manifest:
     best = min(share for share in SHARES if errors[share] <= (1.0 + TIE) * min(errors.values()))
     facts = {**model.manifest.calibration, "error_by_share": {f"{share:g}": error for share, error in errors.items()}}
     return replace(manifests[best], calibration=facts)
+
+
+def with_spread(model: ShapeModel, cases: Sequence[Case]) -> Manifest:
+    """The manifest with the spread of lowest cross-entropy where all else is given."""
+    fidelity = model.manifest.discrepancy["fidelity"]
+    totals: dict[float, list[float]] = {}
+    for case in cases[:: -(-len(cases) // CASES)]:
+        for regime in REGIMES:
+            seen = _fitted(model, case, regime)
+            corrected = seen.corrected(model, DiscrepancyPrior(1.0, fidelity))
+            for spread, score in _scores_of(model, corrected, seen.points, seen.truth):
+                totals.setdefault(spread, []).append(score.cross_entropy)
+    means = {spread: float(np.mean(values)) for spread, values in totals.items()}
+    best = min(means, key=means.__getitem__)
+    facts = {**model.manifest.calibration, "cross_entropy_by_spread": {f"{s:g}": value for s, value in means.items()}}
+    return replace(model.manifest, discrepancy={**model.manifest.discrepancy, "spread_mm": best}, calibration=facts)
 
 
 def _shared(manifest: Manifest, share: float) -> Manifest:

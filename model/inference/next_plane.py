@@ -242,10 +242,8 @@ class Judge:
         found = self._found
         if found.discrepancy is None:
             return np.ones(len(vertices))
-        canonical = found.pose.to_canonical(vertices)
-        return found.discrepancy.shrinkage(
-            self._model.decoder.logits(found.latent[None], canonical[None])[0], canonical
-        )
+        logits = self._model.decoder.logits(found.latent[None], found.pose.to_canonical(vertices)[None])[0]
+        return found.discrepancy.shrinkage(logits)
 
     def _places(self, points: Float[np.ndarray, "m 3"]) -> _Places:
         found = self._found
@@ -259,7 +257,7 @@ class Judge:
         if discrepancy is None:
             none = np.zeros_like(by_parameter)
             return _Places(by_parameter, steepness, none, none, np.zeros((0, len(points))), canonical)
-        moved = by_parameter * discrepancy.levels.by_logit(logits, canonical)[:, None]
+        moved = by_parameter * discrepancy.levels.by_logit(logits)[:, None]
         return _Places(
             by_parameter,
             steepness,

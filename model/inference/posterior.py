@@ -90,7 +90,7 @@ def _derivatives(model: ShapeModel, fit: Fit, canonical: Float[np.ndarray, "n 3"
     if fit.discrepancy is None:
         return FieldDerivatives(logits, by_parameter, by_point)
     field, gradient = fit.discrepancy.corrected_with_gradient(logits, by_point, canonical)
-    return FieldDerivatives(field, fit.discrepancy.shrinkage(logits, canonical)[:, None] * by_parameter, gradient)
+    return FieldDerivatives(field, fit.discrepancy.shrinkage(logits)[:, None] * by_parameter, gradient)
 
 
 def _held(

@@ -165,17 +165,15 @@ def _completion_arrays(state: ShapeState) -> dict[str, np.ndarray]:
     completion = None if discrepancy is None else discrepancy.levels.completion
     if completion is None:
         return {}
-    scales = np.array([completion.lattice.step_mm, completion.share])
-    return {"completion_distances": completion.distances, "completion_scales": scales}
+    return {"completion_shifts": completion.shifts, "completion_step": np.array(completion.lattice.step_mm)}
 
 
 def _completion(arrays: Mapping[str, np.ndarray]) -> Completion | None:
-    if "completion_distances" not in arrays:
+    if "completion_shifts" not in arrays:
         return None
-    distances = arrays["completion_distances"]
-    step, share = map(float, arrays["completion_scales"])
-    i, j, k = distances.shape
-    return Completion(CanonicalLattice((i, j, k), step), distances, share)
+    shifts = arrays["completion_shifts"]
+    i, j, k = shifts.shape
+    return Completion(CanonicalLattice((i, j, k), float(arrays["completion_step"])), shifts)
 
 
 def _discrepancy_arrays(discrepancy: Discrepancy | None) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from model.bundle import ShapeModel
+from model.geometry import CanonicalLattice
 from model.inference.completion.drawn import drawn_at
 from model.inference.completion.field import Completion
 from model.inference.discrepancy.levels import saturated
@@ -13,26 +14,43 @@ from model.inference.fit_types import Fit
 from model.inference.mask_stack import MaskStack
 from model.inference.observations import Observations
 
+#: Within so much (mm) of the lattice's border the completion counts less and less.
+FADING_MM = 4.0
+
 
 def completed(
-    model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations
+    model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations, slope: float
 ) -> Completion | None:
-    """What the model's completion network makes of the drawing, seen from the fitted pose.
+    """What the model's completion network makes of the drawing, seen from the fitted pose, beside the code's shape.
 
-    Planes that the fit left out are left out. None for models without such a network, where it is not trusted, or
-    where it finds no surface.
+    The distance from the surface becomes ``(1 - w) m + w c``, with ``c`` the network's and ``w`` its share. Planes that
+    the fit left out are left out. None for models without such a network, where it is not trusted, or where it finds
+    no surface.
+
+    Args:
+        slope: of the decoder's field at the surface (1/mm).
     """
     network, share = model.completer, model.manifest.completion.get("share", 0.0)
     if network is None or share <= 0.0:
         return None
     trust = np.ones(len(observations.planes)) if found.plane_weights is None else found.plane_weights
     planes = [plane for plane, weight in zip(observations.planes, trust, strict=True) if weight > 0]
-    world = found.pose.to_world(network.lattice.points())
+    points = network.lattice.points()
     reach = 0.5 * network.lattice.step_mm * float(np.exp(-found.pose.log_scale))
-    drawn = drawn_at(world, reach, stacks, planes).reshape(2, *network.lattice.voxels)
+    drawn = drawn_at(found.pose.to_world(points), reach, stacks, planes).reshape(2, *network.lattice.voxels)
     logits = network.logits(drawn)
-    slope = _slope(logits, network.lattice.step_mm)
-    return None if slope is None else Completion(network.lattice, saturated(logits / slope), share)
+    steepness = _slope(logits, network.lattice.step_mm)
+    if steepness is None:
+        return None
+    of_code = model.decoder.logits(found.latent[None], points[None])[0].reshape(logits.shape)
+    more = saturated(logits / steepness) - saturated(of_code / slope)
+    return Completion(network.lattice, share * weights_of(network.lattice) * more)
+
+
+def weights_of(lattice: CanonicalLattice) -> Float[np.ndarray, "i j k"]:
+    """1 well within a lattice and 0 on its border, smooth."""
+    depth = np.clip((lattice.half_mm - np.abs(lattice.points())) / FADING_MM, 0.0, 1.0)
+    return np.asarray(np.prod(depth * depth * (3.0 - 2.0 * depth), axis=1).reshape(lattice.voxels), np.float32)
 
 
 def _slope(logits: Float[np.ndarray, "i j k"], step_mm: float) -> float | None:

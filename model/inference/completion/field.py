@@ -1,4 +1,4 @@
-"""A completed drawing as a field: distances from its surface on a lattice, and how much they count where."""
+"""What a completed drawing changes about the fitted shape, as a field of the canonical frame."""
 
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -9,45 +9,32 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from model.geometry import CanonicalLattice
 
-#: Within so much (mm) of the lattice's border the completion counts less and less.
-FADING_MM = 4.0
 #: Step of the differences that give gradients (mm).
 DIFFERENCE_MM = 0.02
 
 
 @dataclass(frozen=True)
 class Completion:
-    """What the network makes of a drawing.
+    """How much more (mm, positive inside) the distance from the surface is for a network having seen the drawing.
 
     Attributes:
         lattice: its place in the canonical frame.
-        distances: signed distance from the completed surface (mm), positive inside, saturated.
-        share: weight of these distances, beside those from the fitted surface, well within the lattice.
+        shifts: at the lattice's voxels; a cubic spline between them and 0 beyond.
     """
 
     lattice: CanonicalLattice
-    distances: Float[np.ndarray, "i j k"]
-    share: float
+    shifts: Float[np.ndarray, "i j k"]
 
-    def weight(self, canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """`share` well within the lattice, 0 on its border and beyond; smooth."""
-        depth = np.clip((self.lattice.half_mm - np.abs(canonical)) / FADING_MM, 0.0, 1.0)
-        return np.asarray(self.share * np.prod(depth * depth * (3.0 - 2.0 * depth), axis=1))
-
-    def distance(self, canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Distance (mm) from the completed surface, a cubic spline of the lattice's."""
+    def at(self, canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """The shift (mm) at canonical points."""
         places = self.lattice.places(canonical)
-        return np.asarray(map_coordinates(self._splines, places, order=3, prefilter=False, mode="mirror"))
+        return np.asarray(map_coordinates(self._splines, places, order=3, prefilter=False))
 
-    def gradients(
-        self, canonical: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Gradients (1/mm) of weight and distance, by differences."""
-        weight, distance = self.weight(canonical), self.distance(canonical)
-        shifted = [canonical + step for step in DIFFERENCE_MM * np.eye(3)]
-        by_weight = np.stack([self.weight(points) - weight for points in shifted], axis=1)
-        by_distance = np.stack([self.distance(points) - distance for points in shifted], axis=1)
-        return by_weight / DIFFERENCE_MM, by_distance / DIFFERENCE_MM
+    def gradient(self, canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Its gradient, by differences."""
+        here = self.at(canonical)
+        changes = [self.at(canonical + step) - here for step in DIFFERENCE_MM * np.eye(3)]
+        return np.stack(changes, axis=1) / DIFFERENCE_MM
 
     def __getstate__(self) -> dict[str, object]:
         """What it was made of; the splines do not travel."""
@@ -55,4 +42,4 @@ class Completion:
 
     @cached_property
     def _splines(self) -> Float[np.ndarray, "i j k"]:
-        return np.asarray(spline_filter(self.distances, order=3, output=np.float32))
+        return np.asarray(spline_filter(self.shifts, order=3, output=np.float32))

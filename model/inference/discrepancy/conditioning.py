@@ -102,12 +102,12 @@ def discrepancy_of(
         part[0] for part in model.decoder.logits_and_jacobians(found.latent[None], canonical[None])
     )
     slope = float(np.median(np.linalg.norm(by_point, axis=1)))
-    levels = Levels(slope, completed(model, found, stacks, observations))
+    levels = Levels(slope, completed(model, found, stacks, observations, slope))
     by_parameter = np.concatenate([by_latent, found.pose.jacobian(canonical, by_point)], axis=1)
     return Discrepancy(
         points=canonical,
         residuals=saturated(seen.distances) - levels.at(logits, canonical),
-        jacobian=by_parameter * levels.by_logit(logits, canonical)[:, None],
+        jacobian=by_parameter * levels.by_logit(logits)[:, None],
         covariance=prior.covariance,
         noise_mm=prior.noise_mm,
         levels=levels,

@@ -1,8 +1,9 @@
 """How far a point is from the fitted surface, as far as it counts.
 
-Near the surface the fitted logit ``l`` tells the distance (mm): ``m = C tanh(l / (C g))`` with ``g`` the field's slope
+Near the surface the fitted logit ``l`` tells the distance (mm): ``C tanh(l / (C g))`` with ``g`` the field's slope
 there (1/mm) and ``C`` a distance beyond which nothing more is said. Where a network has completed the drawing, its
-distance ``c`` counts as well, with weight ``w``: ``(1 - w) m + w c``.
+shift is added. What the drawing leaves open of the shape it leaves open to the network as well: the code's posterior
+stands for both, so a step of the code moves the surface as it does without the network.
 """
 
 from dataclasses import dataclass
@@ -34,29 +35,21 @@ class Levels:
     completion: Completion | None = None
 
     def of_code(self, logits: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """``m`` (mm): what code and pose alone say."""
+        """What code and pose alone say (mm)."""
         return saturated(logits / self.slope)
 
     def at(self, logits: Float[np.ndarray, "n"], canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Distance (mm) at canonical points where the decoder gives these logits."""
         own = self.of_code(logits)
-        if self.completion is None:
-            return own
-        return np.asarray(own + self.completion.weight(canonical) * (self.completion.distance(canonical) - own))
+        return own if self.completion is None else np.asarray(own + self.completion.at(canonical))
 
-    def by_logit(self, logits: Float[np.ndarray, "n"], canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def by_logit(self, logits: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Derivative of the distance by the logit (mm)."""
-        own = (1.0 - np.square(np.tanh(logits / (REACH_MM * self.slope)))) / self.slope
-        return np.asarray(own if self.completion is None else own * (1.0 - self.completion.weight(canonical)))
+        return np.asarray((1.0 - np.square(np.tanh(logits / (REACH_MM * self.slope)))) / self.slope)
 
     def gradient(
         self, logits: Float[np.ndarray, "n"], by_point: Float[np.ndarray, "n 3"], canonical: Float[np.ndarray, "n 3"]
     ) -> Float[np.ndarray, "n 3"]:
         """Gradient of the distance where the decoder gives these logits and derivatives by canonical point (1/mm)."""
-        through_logits = self.by_logit(logits, canonical)[:, None] * by_point
-        if self.completion is None:
-            return np.asarray(through_logits)
-        by_weight, by_distance = self.completion.gradients(canonical)
-        more = self.completion.distance(canonical) - self.of_code(logits)
-        weight = self.completion.weight(canonical)
-        return np.asarray(through_logits + more[:, None] * by_weight + weight[:, None] * by_distance)
+        own = self.by_logit(logits)[:, None] * by_point
+        return own if self.completion is None else np.asarray(own + self.completion.gradient(canonical))

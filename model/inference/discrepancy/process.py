@@ -78,9 +78,9 @@ class Discrepancy:
         value = self.levels.at(logits, canonical) + mean
         return self.slope * value, self.slope * (self.levels.gradient(logits, by_point, canonical) + slopes)
 
-    def shrinkage(self, logits: Float[np.ndarray, "m"], canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
+    def shrinkage(self, logits: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
         """Derivative of ``g m`` by the logit."""
-        return self.slope * self.levels.by_logit(logits, canonical)
+        return self.slope * self.levels.by_logit(logits)
 
     def mean(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
         """Posterior mean (mm); 0 outside the box."""

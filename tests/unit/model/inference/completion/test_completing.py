@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from model.geometry import Pose
-from model.inference.completion.completing import completed
+from model.inference.completion.completing import completed, weights_of
 from model.inference.discrepancy.conditioning import DiscrepancyPrior
 from model.inference.discrepancy.levels import saturated
 from model.inference.fitting import FitOptions, fit
@@ -25,6 +25,8 @@ GRID = cube_around(CENTRE)
 STACK = drawn(SHAPE, GRID)
 OBSERVATIONS = observed(STACK)
 FOUND = fit(MODEL, OBSERVATIONS, FitOptions(robust=False))
+#: Of the decoder's field at the surface (1/mm), about.
+SLOPE = 1.0
 
 
 def answer(model, stack=STACK, planes=ORTHOGONAL, **options):
@@ -36,7 +38,7 @@ class TestWhatItSees:
     def test_the_drawing_in_the_fitted_frame_at_the_models_size(self, scale):
         network = KnownCompleter(sphere(9.0).logits)
         found = replace(FOUND, pose=Pose(CENTRE + np.array([0.2, 0.3, 0.15]), rotation(20.0), float(np.log(scale))))
-        completed(completing(MODEL, network, 0.5), found, [STACK], OBSERVATIONS)
+        completed(completing(MODEL, network, 0.5), found, [STACK], OBSERVATIONS, SLOPE)
         inside, outside = (seen.ravel() for seen in network.seen[0])
         gap = SHAPE.logits(found.pose.to_world(LATTICE.points()))
         assert (gap[inside] > -1.0).all()
@@ -48,7 +50,7 @@ class TestWhatItSees:
         network = KnownCompleter(sphere(9.0).logits)
         left = replace(FOUND, plane_weights=np.array([0.0, 1.0, 1.0]))
         for found in (FOUND, left):
-            completed(completing(MODEL, network, 0.5), found, [STACK], OBSERVATIONS)
+            completed(completing(MODEL, network, 0.5), found, [STACK], OBSERVATIONS, SLOPE)
         assert network.seen[1].sum() < network.seen[0].sum()
 
     def test_the_same_however_object_and_image_lie(self):
@@ -67,7 +69,7 @@ class TestWhatBecomesOfIt:
     def test_nothing_where_there_is_no_network_or_it_has_no_weight_or_finds_nothing(self):
         empty = KnownCompleter(lambda points: np.full(len(points), -3.0))
         for model in (MODEL, completing(MODEL, BallCompleter(8.0), 0.0), completing(MODEL, empty, 0.5)):
-            assert completed(model, FOUND, [STACK], OBSERVATIONS) is None
+            assert completed(model, FOUND, [STACK], OBSERVATIONS, SLOPE) is None
         np.testing.assert_array_equal(
             answer(completing(MODEL, BallCompleter(8.0), 0.0)).mesh.vertices, answer(MODEL).mesh.vertices
         )
@@ -75,9 +77,11 @@ class TestWhatBecomesOfIt:
     def test_its_logits_are_distances_in_mm_however_steep_they_are(self):
         for steepness in (0.5, 4.0):
             network = KnownCompleter(sphere(9.0).logits, steepness=steepness)
-            found = completed(completing(MODEL, network, 0.5), FOUND, [STACK], OBSERVATIONS)
-            expected = saturated(sphere(9.0).logits(LATTICE.points()))
-            np.testing.assert_allclose(found.distances.ravel(), expected, atol=0.1)
+            found = completed(completing(MODEL, network, 0.5), FOUND, [STACK], OBSERVATIONS, SLOPE)
+            code = MODEL.decoder.logits(FOUND.latent[None], LATTICE.points()[None])[0]
+            expected = saturated(sphere(9.0).logits(LATTICE.points())) - saturated(code / SLOPE)
+            inner = weights_of(LATTICE).ravel() == 1.0
+            np.testing.assert_allclose(found.shifts.ravel()[inner], 0.5 * expected[inner], atol=0.06)
 
     def test_far_from_the_drawing_the_surface_lies_between_code_and_completion_and_on_it_at_the_contours(self):
         """The network says a ball of 12 mm, where the code says 9 and 7 mm; five planes hold both."""

@@ -130,7 +130,7 @@ def test_field_is_the_decoders_where_nothing_was_observed_and_near_its_surface()
 def test_shrinkage_is_the_derivative_by_the_logit():
     logits, far = np.linspace(-20.0, 20.0, 9), np.tile([300.0, 0.0, 0.0], (9, 1))
     change = (PROCESS.corrected(logits + 1e-4, far) - PROCESS.corrected(logits - 1e-4, far)) / 2e-4
-    np.testing.assert_allclose(PROCESS.shrinkage(logits, far), change, atol=1e-6)
+    np.testing.assert_allclose(PROCESS.shrinkage(logits), change, atol=1e-6)
 
 
 def test_cells_hold_their_means_and_keep_kinds_apart():
