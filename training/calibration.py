@@ -6,8 +6,8 @@ fidelity of the discrepancy). Precision and fidelity are those that leave the fe
 wrong side, the lowest of those that hardly differ; the spread, which moves no surface, is the one with the lowest
 cross-entropy of the posterior mean occupancy there, a proper score. With these, answers to sound drawings tell what is
 usual and typical for the model (`training.usual`) and how wide its SDs have to be (`training.posterior_scale`).
-Of models that have a network to complete drawings, the weight of what it says is chosen by the same error after that,
-and the spread once more.
+Of models that have a network to complete drawings, the weight of what it says is chosen by the average surface distance
+after that, and the spread once more.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,12 +20,11 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from model.bundle import Manifest, ShapeModel, open_bundle, write_manifest
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_prior, with_discrepancy
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
 from model.inference.fitting import Fit, FitOptions, fit
 from model.inference.observations import Observations, observe
 from model.inference.posterior import (
     fitted_jacobians,
-    fitted_logits,
     laplace_covariance,
     logit_variance,
     mean_probability,
@@ -35,6 +34,7 @@ from model.inference.reconstruction import COVER_SHARE_OF_BAND, OBSERVATION_BUDG
 from model.inference.thick_slices import through_thickness
 from training.cohorts.cohort import Case, Cohort
 from training.config import Regime
+from training.evaluate import surface_distance
 from training.posterior_scale import posterior_scale
 from training.sparsify import Drawing, for_evaluation
 from training.usual import sound_answers, typical_figures, usual_figures
@@ -51,8 +51,9 @@ BAND_MM = 5.0
 SCORED_VOXELS = 4000
 #: Errors that differ by less than this share count as equal: the least precision then gives the quickest fit.
 TIE = 0.005
-#: Evenly spaced validation cases that are used, and those whose sound drawings are answered in the end.
-CASES, JUDGED_CASES = 8, 12
+#: Evenly spaced validation cases that are used, those with which completed drawings are weighed, and those whose sound
+#: drawings are answered in the end.
+CASES, COMPLETED_CASES, JUDGED_CASES = 8, 24, 12
 
 Watch = Callable[[float], None]
 
@@ -140,17 +141,19 @@ def calibrate_bundle(
 
 
 def with_share(model: ShapeModel, cases: Sequence[Case]) -> Manifest:
-    """The manifest with the weight of completed drawings that leaves the fewest voxels on the wrong side."""
-    chosen = cases[:: -(-len(cases) // JUDGED_CASES)]
-    manifests = {share: _shared(model.manifest, share) for share in SHARES}
-    errors = {
+    """The manifest with the least weight of completed drawings that brings surfaces nearest to the masks."""
+    chosen = cases[:: -(-len(cases) // COMPLETED_CASES)]
+    manifests = {
+        share: replace(model.manifest, completion={**model.manifest.completion, "share": share}) for share in SHARES
+    }
+    distances = {
         share: float(
-            np.mean([wrong_share(replace(model, manifest=manifest), c, regime) for c in chosen for regime in REGIMES])
+            np.mean([surface_distance(replace(model, manifest=manifest), c, r) for c in chosen for r in REGIMES])
         )
         for share, manifest in manifests.items()
     }
-    best = min(share for share in SHARES if errors[share] <= (1.0 + TIE) * min(errors.values()))
-    facts = {**model.manifest.calibration, "error_by_share": {f"{share:g}": error for share, error in errors.items()}}
+    best = min(share for share in SHARES if distances[share] <= (1.0 + TIE) * min(distances.values()))
+    facts = {**model.manifest.calibration, "asd_mm_by_share": {f"{share:g}": mm for share, mm in distances.items()}}
     return replace(manifests[best], calibration=facts)
 
 
@@ -168,17 +171,6 @@ def with_spread(model: ShapeModel, cases: Sequence[Case]) -> Manifest:
     best = min(means, key=means.__getitem__)
     facts = {**model.manifest.calibration, "cross_entropy_by_spread": {f"{s:g}": value for s, value in means.items()}}
     return replace(model.manifest, discrepancy={**model.manifest.discrepancy, "spread_mm": best}, calibration=facts)
-
-
-def _shared(manifest: Manifest, share: float) -> Manifest:
-    return replace(manifest, completion={**manifest.completion, "share": share})
-
-
-def wrong_share(model: ShapeModel, case: Case, regime: Regime) -> float:
-    """Share of the voxels near the true surface that the reconstruction of one drawing has on the wrong side."""
-    seen = _fitted(model, case, regime)
-    corrected = seen.corrected(model, discrepancy_prior(model.manifest))
-    return float(np.mean((fitted_logits(model, corrected, seen.points) > 0) != seen.truth))
 
 
 def calibrate_bundle_as(folder: Path, known: Manifest, cohort: Cohort, *, threads: int | None = None) -> None:

@@ -153,6 +153,12 @@ def fills_of(model: ShapeModel, seed: int) -> dict[Method, Fill]:
     }
 
 
+def surface_distance(model: ShapeModel, case: Case, regime: Regime, *, seed: int = 0) -> float:
+    """Average surface distance (mm) of the reconstruction of one drawing from the dense mask."""
+    found = fills_of(model, seed)[Method.MODEL](for_evaluation(case.mask, case.grid, regime), case.grid)
+    return agreement(case.mask, found, case.grid.spacing).asd_mm
+
+
 def measure(case: Case, regime: Regime, drawing: Drawing, method: Method, fill: Fill) -> Measurement:
     """One method on one drawing; a drawing that it cannot take is an answer, not an error."""
     begin = time.perf_counter()

@@ -19,12 +19,10 @@ from model.errors import InvalidParameter
 from training.calibration import PRECISIONS, with_precision
 from training.cohorts.cohort import Case
 from training.config import Regime
-from training.evaluate import Method, fills_of
-from training.metrics_masks import agreement
+from training.evaluate import surface_distance
 from training.pruning import PriorParts
 from training.release import trial_model
 from training.runs import mask_digest, read_record
-from training.sparsify import for_evaluation
 
 #: Drawings of validation shapes that are reconstructed.
 REGIMES: tuple[Regime, ...] = ("thin", "orthogonal")
@@ -133,10 +131,5 @@ def _errors(
     model: ShapeModel, precision: float, cases: Sequence[Case], regimes: Sequence[Regime]
 ) -> Float[np.ndarray, "n"]:
     """Average surface distance (mm) of each case at a likelihood precision (1/mm^2), mean over its drawings."""
-    fill = fills_of(with_precision(model, precision), seed=0)[Method.MODEL]
-
-    def error(case: Case, regime: Regime) -> float:
-        found = fill(for_evaluation(case.mask, case.grid, regime), case.grid)
-        return agreement(case.mask, found, case.grid.spacing).asd_mm
-
-    return np.array([np.mean([error(case, regime) for regime in regimes]) for case in cases])
+    trial = with_precision(model, precision)
+    return np.array([np.mean([surface_distance(trial, case, regime) for regime in regimes]) for case in cases])

@@ -274,7 +274,7 @@ class TestComplete:
         result = run("calibrate", folder, "--masks", bundle.parent / "masks", "--json")
         assert result.exit_code == 0, result.stderr
         manifest, _ = read_manifest(folder)
-        errors, share = manifest.calibration["error_by_share"], manifest.completion["share"]
+        errors, share = manifest.calibration["asd_mm_by_share"], manifest.completion["share"]
         assert [float(tried) for tried in errors] == list(SHARES)
         assert errors[f"{share:g}"] <= 1.005 * min(errors.values())
         assert json.loads(result.stdout)["completion_share"] == share
