@@ -220,10 +220,15 @@ def _check_listed(folder: Path, manifest: Manifest, suffix: str) -> None:
         raise BundleCorrupt(f"{MANIFEST} does not list {', '.join(unlisted)}; export or copy the bundle anew.")
 
 
+def file_digest(path: Path) -> str:
+    """SHA-256 of a bundle's file, as the manifest holds it."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 def _check_file(path: Path, expected: str) -> None:
     if not path.is_file():
         raise BundleIncomplete(f"The bundle lacks {path.name}, which its manifest lists.")
-    if hashlib.sha256(path.read_bytes()).hexdigest() != expected:
+    if file_digest(path) != expected:
         raise BundleCorrupt(f"{path.name} differs from the SHA-256 in the manifest; export or copy the bundle anew.")
 
 

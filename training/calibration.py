@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from model.bundle import Manifest, ShapeModel, open_bundle, write_manifest
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, corrected, with_discrepancy
 from model.inference.fitting import Fit, FitOptions, fit
 from model.inference.observations import Observations, observe
 from model.inference.posterior import (
@@ -43,8 +43,8 @@ from training.usual import sound_answers, typical_figures, usual_figures
 PRECISIONS = (0.1, 0.2, 0.4, 0.8)
 FIDELITIES = (0.15, 0.3, 0.5, 0.7, 0.85)
 SPREADS_MM = (0.2, 0.35, 0.6, 1.0, 1.7)
-#: Weights of a completed drawing beside the fitted surface that are tried.
-SHARES = (0.0, 0.25, 0.5, 0.75)
+#: Weights of a completed drawing beside the fitted surface that are tried, and the one before any was chosen.
+SHARES, UNCALIBRATED_SHARE = (0.0, 0.25, 0.5, 0.75), 0.5
 REGIMES: tuple[Regime, ...] = ("orthogonal", "thin", "thick")
 #: Voxels this close to the true surface are scored (mm), at most so many of a case.
 BAND_MM = 5.0
@@ -119,7 +119,7 @@ def calibrate_bundle(
     Raises:
         BundleError: the bundle cannot be trusted.
     """
-    model = open_bundle(folder, threads=threads)
+    model = uncalibrated_share(open_bundle(folder, threads=threads))
     found = calibrate(model, cohort.validation, watch)
     facts: dict[str, object] = {
         "cohort": cohort.name,
@@ -134,27 +134,40 @@ def calibrate_bundle(
         model.manifest, likelihood_precision=found.best.precision, discrepancy=discrepancy, calibration=facts
     )
     if model.completer is not None:
-        changed = with_share(replace(model, manifest=changed), cohort.validation)
+        changed = with_share(replace(model, manifest=changed), cohort.validation, watch)
         changed = with_spread(replace(model, manifest=changed), cohort.validation)
     write_manifest(with_sound_drawings(replace(model, manifest=changed), cohort.validation, watch), folder)
     return found
 
 
-def with_share(model: ShapeModel, cases: Sequence[Case]) -> Manifest:
+def stages(manifest: Manifest) -> int:
+    """How often calibrating a bundle tells its watcher that it has come further."""
+    return len(PRECISIONS) + (len(SHARES) if manifest.completion else 0) + 1
+
+
+def counting(model: ShapeModel, share: float) -> ShapeModel:
+    """The model with another weight of completed drawings."""
+    return replace(model, manifest=replace(model.manifest, completion={**model.manifest.completion, "share": share}))
+
+
+def uncalibrated_share(model: ShapeModel) -> ShapeModel:
+    """The model as it was before a weight of completed drawings was chosen; itself without such a network."""
+    return model if model.completer is None else counting(model, UNCALIBRATED_SHARE)
+
+
+def with_share(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda precision: None) -> Manifest:
     """The manifest with the least weight of completed drawings that brings surfaces nearest to the masks."""
     chosen = cases[:: -(-len(cases) // COMPLETED_CASES)]
-    manifests = {
-        share: replace(model.manifest, completion={**model.manifest.completion, "share": share}) for share in SHARES
-    }
-    distances = {
-        share: float(
-            np.mean([surface_distance(replace(model, manifest=manifest), c, r) for c in chosen for r in REGIMES])
+    distances: dict[float, float] = {}
+    for share in SHARES:
+        trial = counting(model, share)
+        distances[share] = float(
+            np.mean([surface_distance(trial, case, regime) for case in chosen for regime in REGIMES])
         )
-        for share, manifest in manifests.items()
-    }
+        watch(model.manifest.likelihood_precision)
     best = min(share for share in SHARES if distances[share] <= (1.0 + TIE) * min(distances.values()))
     facts = {**model.manifest.calibration, "asd_mm_by_share": {f"{share:g}": mm for share, mm in distances.items()}}
-    return replace(manifests[best], calibration=facts)
+    return replace(counting(model, best).manifest, calibration=facts)
 
 
 def with_spread(model: ShapeModel, cases: Sequence[Case]) -> Manifest:
@@ -164,8 +177,8 @@ def with_spread(model: ShapeModel, cases: Sequence[Case]) -> Manifest:
     for case in cases[:: -(-len(cases) // CASES)]:
         for regime in REGIMES:
             seen = _fitted(model, case, regime)
-            corrected = seen.corrected(model, DiscrepancyPrior(1.0, fidelity))
-            for spread, score in _scores_of(model, corrected, seen.points, seen.truth):
+            following = seen.corrected(model, DiscrepancyPrior(1.0, fidelity))
+            for spread, score in _scores_of(model, following, seen.points, seen.truth):
                 totals.setdefault(spread, []).append(score.cross_entropy)
     means = {spread: float(np.mean(values)) for spread, values in totals.items()}
     best = min(means, key=means.__getitem__)
@@ -219,14 +232,14 @@ def scores(model: ShapeModel, case: Case, regime: Regime) -> Iterator[tuple[Cand
     """Score of each candidate on one drawing."""
     seen = _fitted(model, case, regime)
     for fidelity in FIDELITIES:
-        corrected = seen.corrected(model, DiscrepancyPrior(1.0, fidelity))
-        for spread, value in _scores_of(model, corrected, seen.points, seen.truth):
+        following = seen.corrected(model, DiscrepancyPrior(1.0, fidelity))
+        for spread, value in _scores_of(model, following, seen.points, seen.truth):
             yield Candidate(model.manifest.likelihood_precision, fidelity, spread), value
 
 
 @dataclass(frozen=True)
 class _Fitted:
-    """A fit to one drawing of a case, and voxels (world mm) near the true surface with their labels."""
+    """A fit to one drawing of a case with its discrepancy, and voxels (world mm) near the true surface with labels."""
 
     drawing: Drawing
     observations: Observations
@@ -235,8 +248,8 @@ class _Fitted:
     truth: Bool[np.ndarray, "n"]
 
     def corrected(self, model: ShapeModel, prior: DiscrepancyPrior) -> Fit:
-        """The fit with its discrepancy."""
-        return with_discrepancy(model, self.found, [self.drawing.stack], self.observations, prior)
+        """The fit with its discrepancy under another prior."""
+        return corrected(model, self.found, [self.drawing.stack], self.observations, prior)
 
 
 def _fitted(model: ShapeModel, case: Case, regime: Regime) -> _Fitted:
@@ -247,6 +260,7 @@ def _fitted(model: ShapeModel, case: Case, regime: Regime) -> _Fitted:
     options = FitOptions(robust=False)
     fitted = fit(model, observations, options)
     found, _ = through_thickness(model, fitted, [drawing.stack], observations, options)
+    found = with_discrepancy(model, found, [drawing.stack], observations, DiscrepancyPrior())
     index = np.argwhere(near_surface(case.mask, case.grid.spacing))
     index = index[:: -(-len(index) // SCORED_VOXELS)]
     points, truth = case.grid.to_world(index.astype(float)), case.mask[tuple(index.T)]

@@ -257,30 +257,28 @@ def calibrate(
     """Choose on validation shapes how much a drawn mm^2 is worth and how far slices are followed; record both."""
     with exit_status():
         from model.bundle import read_manifest
-        from training.calibration import PRECISIONS, calibrate_bundle
+        from training.calibration import calibrate_bundle, stages
 
         found = open_cohort(source, options)
         if not found.validation:
             raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
-        with progress(len(PRECISIONS) + 1, f"calibrating on {found.name}") as bar:
+        with progress(stages(read_manifest(bundle)[0]), f"calibrating on {found.name}") as bar:
             chosen = calibrate_bundle(bundle, found, lambda precision: bar.advance(bar.task_ids[0]))
-        best = chosen.best
+        best, manifest = chosen.best, read_manifest(bundle)[0]
+        spread_mm, share = manifest.discrepancy["spread_mm"], manifest.completion.get("share")
         summary = {
             "likelihood_precision": best.precision,
             "fidelity": best.fidelity,
-            "spread_mm": best.spread_mm,
-            "posterior": read_manifest(bundle)[0].posterior,
+            "spread_mm": spread_mm,
+            "posterior": manifest.posterior,
             "error_by_precision_and_fidelity": chosen.errors(),
-            "cross_entropy_by_spread": chosen.cross_entropies(),
+            "cross_entropy_by_spread": manifest.calibration["cross_entropy_by_spread"],
+            **({} if share is None else {"completion_share": share}),
         }
-        completion = read_manifest(bundle)[0].completion
-        if completion:
-            summary["completion_share"] = completion["share"]
-        counted = f", completed drawings count {completion['share']:g}" if completion else ""
         words = (
             f"likelihood precision {best.precision:g} per mm^2, fidelity {best.fidelity:g}, "
-            f"spread {best.spread_mm:g} mm ({100.0 * chosen.scores[best].error:.2f} % of voxels near the surface wrong)"
-            + counted
+            f"spread {spread_mm:g} mm ({100.0 * chosen.scores[best].error:.2f} % of voxels near the surface wrong)"
+            + ("" if share is None else f", completed drawings count {share:g}")
         )
         typer.echo(json.dumps(summary) if as_json else words)
 

@@ -1,6 +1,5 @@
 """A finished run as a bundle: graphs, statistics of the training codes, and a manifest."""
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from model.bundle import POPULATION, Manifest, Population, ShapeModel, write_manifest
+from model.bundle import POPULATION, Manifest, Population, ShapeModel, file_digest, write_manifest
 from model.errors import InvalidParameter
 from model.networks.decoder import OccupancyDecoder
 from model.networks.export import export_graphs, quiet_exporter, torch_networks
@@ -63,7 +62,7 @@ def export_run(
         likelihood_precision=likelihood_precision,
         accuracy={regime: dict(figures) for regime, figures in (accuracy or {}).items()},
         anatomy=dict(anatomy or {}),
-        files={file: _digest(output / file) for file in sorted([*files, POPULATION])},
+        files={file: file_digest(output / file) for file in sorted([*files, POPULATION])},
     )
     write_manifest(manifest, output)
     return manifest
@@ -194,7 +193,3 @@ def training_facts(config: TrainingConfig, record: Mapping[str, Any]) -> dict[st
         "refused": record["refused"],
         "config": config.as_dict(),
     }
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

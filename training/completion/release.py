@@ -1,22 +1,21 @@
 """A bundle with a completion network, trained for it on a cohort."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from model.bundle import read_manifest, write_manifest
+from model.bundle import file_digest, read_manifest, write_manifest
 from model.networks.completion import MULTIPLE
 from model.networks.completion_export import export_completion
+from training.calibration import UNCALIBRATED_SHARE
 from training.cohorts.cohort import Cohort
 from training.completion.samples import lattice_for, windows_of
 from training.completion.trainer import CompletionConfig, Watch, train_completion
 from training.points import Window
+from training.runs import mask_digest
 
 #: Voxels of the lattice at most, and its least step (mm).
 MOST_VOXELS, LEAST_STEP_MM = 110_000, 1.0
-#: Weight of the completion beside the fitted surface before `morphoflow calibrate` has chosen one.
-UNCALIBRATED_SHARE = 0.5
 
 
 def completion_config(cohort: Cohort, windows: Sequence[Window], steps: int | None, seed: int) -> CompletionConfig:
@@ -45,12 +44,14 @@ def complete_bundle(
 
     Raises:
         BundleError: the bundle cannot be trusted.
+        InvalidParameter: the folder holds a training of other masks or settings.
         ParityError: the exported graphs disagree with the network.
     """
     manifest, _ = read_manifest(folder)
     windows = windows_of(cohort.train)
     config = completion_config(cohort, windows, steps, seed)
-    net = train_completion(windows, config, run, device=device, watch=watch)
+    masks = [mask_digest(case) for case in cohort.train]
+    net = train_completion(windows, config, run, masks=masks, device=device, watch=watch)
     written = export_completion(net, folder)
     facts = {
         "voxels": list(config.voxels),
@@ -58,6 +59,7 @@ def complete_bundle(
         "share": UNCALIBRATED_SHARE,
         "training": {**asdict(config), "cohort": cohort.name, "shapes": len(cohort.train)},
     }
-    files = {**manifest.files, **{name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in written}}
-    write_manifest(replace(manifest, completion=facts, files=dict(sorted(files.items()))), folder)
+    files = {**manifest.files, **{name: file_digest(folder / name) for name in written}}
+    # What was measured before does not hold any more.
+    write_manifest(replace(manifest, completion=facts, accuracy={}, files=dict(sorted(files.items()))), folder)
     return config

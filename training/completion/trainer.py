@@ -1,9 +1,10 @@
 """Training of a completion network: random drawings in, dense masks out; resumes where it was left."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from model.errors import InvalidParameter
 from model.geometry import CanonicalLattice
 from model.networks.completion import CompletionNet, CompletionShape
 from training.completion.samples import Sample, random_sample
@@ -62,21 +64,27 @@ def train_completion(
     config: CompletionConfig,
     folder: Path,
     *,
+    masks: Sequence[str] = (),
     device: str = "cpu",
     half: bool | None = None,
     watch: Watch = lambda step, loss: None,
 ) -> CompletionNet:
-    """Train to the end, from the folder's checkpoint where there is one of the same settings.
+    """Train to the end, from the folder's checkpoint where there is one.
 
     Args:
+        masks: digests of the masks, by which a checkpoint is known to be of the same ones.
         half: whether the network computes in bfloat16 while it learns; where the device does so in matrix units, when
             None.
+
+    Raises:
+        InvalidParameter: the checkpoint is of other masks or settings.
     """
+    made_of = {"config": asdict(config), "masks": list(masks)}
     half = _has_matrix_units(device) if half is None else half
     torch.manual_seed(config.seed)
     net = CompletionNet(CompletionShape(config.voxels, config.width)).to(device)
     optimiser = torch.optim.AdamW(net.parameters(), config.learning_rate, weight_decay=config.weight_decay)
-    begin = _resumed(net, optimiser, config, folder / CHECKPOINT)
+    begin = _resumed(net, optimiser, made_of, folder / CHECKPOINT)
     folder.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         for step in range(begin, config.steps):
@@ -93,7 +101,7 @@ def train_completion(
             optimiser.step()
             watch(step + 1, loss.item())
             if (step + 1) % SAVED_EVERY == 0 or step + 1 == config.steps:
-                _save(net, optimiser, config, step + 1, folder / CHECKPOINT)
+                _save(net, optimiser, made_of, step + 1, folder / CHECKPOINT)
     return net.cpu().eval()
 
 
@@ -133,28 +141,29 @@ def _has_matrix_units(device: str) -> bool:
 
 def _share(step: int, steps: int) -> float:
     """Of the learning rate: a rise, then a cosine."""
-    return (
-        min(1.0, (step + 1) / max(1.0, min(RISE, RISE_SHARE * steps)))
-        * 0.5
-        * (1.0 + float(np.cos(np.pi * step / steps)))
-    )
+    risen = min(1.0, (step + 1) / max(1.0, min(RISE, RISE_SHARE * steps)))
+    return risen * 0.5 * (1.0 + float(np.cos(np.pi * step / steps)))
 
 
-def _resumed(net: CompletionNet, optimiser: torch.optim.Optimizer, config: CompletionConfig, path: Path) -> int:
+def _resumed(net: CompletionNet, optimiser: torch.optim.Optimizer, made_of: Mapping[str, Any], path: Path) -> int:
     """Steps that were done already."""
     if not path.is_file():
         return 0
     state = torch.load(path, map_location="cpu", weights_only=True)
-    if state["config"] != asdict(config):
-        return 0
+    if {name: state.get(name) for name in made_of} != made_of:
+        raise InvalidParameter(
+            "The training in the folder of the run was made of other masks or settings; the same ones, or another "
+            "folder, are accepted.",
+            part="run",
+        )
     net.load_state_dict(state["net"])
     optimiser.load_state_dict(state["optimiser"])
     return int(state["step"])
 
 
 def _save(
-    net: CompletionNet, optimiser: torch.optim.Optimizer, config: CompletionConfig, step: int, path: Path
+    net: CompletionNet, optimiser: torch.optim.Optimizer, made_of: Mapping[str, Any], step: int, path: Path
 ) -> None:
-    state = {"config": asdict(config), "net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step}
+    state = {**made_of, "net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step}
     torch.save(state, path.with_suffix(".new"))
     path.with_suffix(".new").replace(path)

@@ -48,11 +48,13 @@ def completed(
         return None
     of_code = model.decoder.logits(found.latent[None], points[None])[0].reshape(logits.shape)
     more = saturated(logits / steepness) - saturated(of_code / slope)
-    return Completion(network.lattice, share * placed(found, network.lattice) * weights_of(network.lattice) * more)
+    return Completion(
+        network.lattice, share * trust_in_place(found, network.lattice) * weights_of(network.lattice) * more
+    )
 
 
-def placed(found: Fit, lattice: CanonicalLattice) -> float:
-    """How far a fit knows the place: 1 up to `PLACED_STEPS`, falling with the variance of the position beyond."""
+def trust_in_place(found: Fit, lattice: CanonicalLattice) -> float:
+    """1 where the SD of the fitted position is up to `PLACED_STEPS`, falling with its variance beyond."""
     size = len(found.latent)
     position = laplace_covariance(found)[size : size + 3, size : size + 3]
     sd = float(np.sqrt(np.trace(position) / 3.0) * np.exp(found.pose.log_scale))

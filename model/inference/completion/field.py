@@ -8,9 +8,7 @@ from jaxtyping import Float
 from scipy.ndimage import map_coordinates, spline_filter
 
 from model.geometry import CanonicalLattice
-
-#: Step of the differences that give gradients (mm).
-DIFFERENCE_MM = 0.02
+from model.inference.differences import differences
 
 
 @dataclass(frozen=True)
@@ -31,10 +29,8 @@ class Completion:
         return np.asarray(map_coordinates(self._splines, places, order=3, prefilter=False))
 
     def gradient(self, canonical: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Its gradient, by differences."""
-        here = self.at(canonical)
-        changes = [self.at(canonical + step) - here for step in DIFFERENCE_MM * np.eye(3)]
-        return np.stack(changes, axis=1) / DIFFERENCE_MM
+        """Its gradient (mm by mm)."""
+        return differences(self.at, canonical, self.at(canonical))
 
     def __getstate__(self) -> dict[str, object]:
         """What it was made of; the splines do not travel."""

@@ -77,11 +77,15 @@ def with_discrepancy(
 def corrected(
     model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations, prior: DiscrepancyPrior
 ) -> Fit:
-    """The fit with its discrepancy under a prior; itself when it has that already."""
+    """The fit with its discrepancy under a prior; what it has observed already is not observed again."""
     made = found.discrepancy
-    if made is not None and (made.covariance, made.noise_mm) == (prior.covariance, prior.noise_mm):
+    if made is None:
+        return with_discrepancy(model, found, stacks, observations, prior)
+    if prior.fidelity <= 0.0:
+        return replace(found, discrepancy=None)
+    if (made.covariance, made.noise_mm) == (prior.covariance, prior.noise_mm):
         return found
-    return with_discrepancy(model, found, stacks, observations, prior)
+    return replace(found, discrepancy=replace(made, covariance=prior.covariance, noise_mm=prior.noise_mm))
 
 
 def discrepancy_of(

@@ -20,6 +20,7 @@ from scipy.linalg.lapack import spotrf, strtrs
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial import cKDTree
 
+from model.inference.differences import differences
 from model.inference.discrepancy.covariance import Axes, Covariance
 from model.inference.discrepancy.gathering import GatheredPoints
 from model.inference.discrepancy.grouping import cells_of, means_of
@@ -27,8 +28,6 @@ from model.inference.discrepancy.levels import Levels
 
 #: Steps of the lattice that holds the process, of its shortest length.
 LATTICE_STEPS = 1.75
-#: Step of the differences that give the gradient (mm).
-DIFFERENCE_MM = 0.02
 #: Contour points that tell the variance at a point, and how far they hold it.
 NEAREST = 64
 #: Size of the cells whose points have these in common, in shortest lengths.
@@ -97,8 +96,7 @@ class Discrepancy:
     ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 3"]]:
         """Posterior mean (mm) and its gradient, by differences."""
         mean = self.mean(canonical)
-        changes = [self.mean(canonical + step) - mean for step in DIFFERENCE_MM * np.eye(3)]
-        return mean, np.stack(changes, axis=1) / DIFFERENCE_MM
+        return mean, differences(self.mean, canonical, mean)
 
     def variance(self, canonical: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
         """Posterior variance (mm^2), given the `NEAREST` contour points (Vecchia's approximation, 1988).

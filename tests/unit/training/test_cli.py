@@ -261,6 +261,7 @@ class TestComplete:
         assert {"completion.onnx", "completion.pt"} <= manifest.files.keys()
         assert open_bundle(folder / "bundle").completer.lattice.voxels == tuple(told["voxels"])
         assert "/" not in json.dumps(manifest.completion)
+        assert manifest.accuracy == {}
 
     def test_a_finished_training_is_taken_as_it_is(self, completed, run, bundle, tmp_path):
         folder, _ = completed
@@ -268,6 +269,16 @@ class TestComplete:
         words = ("complete", other, "--masks", bundle.parent / "masks", "--steps", 20, "--run", folder / "run")
         assert run(*words, "--device", "cpu").exit_code == 0
         assert (other / "completion.onnx").read_bytes() == (folder / "bundle" / "completion.onnx").read_bytes()
+
+    def test_a_training_of_other_masks_or_settings_is_not_written_over(self, completed, run, bundle):
+        folder, _ = completed
+        before = (folder / "run" / "completion.pt").read_bytes()
+        words = ("complete", folder / "bundle", "--masks", bundle.parent / "masks", "--run", folder / "run")
+        for other in (("--steps", 21), ("--steps", 20, "--seed", 1)):
+            result = run(*words, *other, "--device", "cpu")
+            assert result.exit_code == 2
+            assert "other masks or settings" in result.stderr
+        assert (folder / "run" / "completion.pt").read_bytes() == before
 
     def test_calibration_chooses_its_weight_by_validation_shapes(self, completed, run, bundle, tmp_path):
         folder = shutil.copytree(completed[0] / "bundle", tmp_path / "calibrated")
@@ -277,7 +288,13 @@ class TestComplete:
         errors, share = manifest.calibration["asd_mm_by_share"], manifest.completion["share"]
         assert [float(tried) for tried in errors] == list(SHARES)
         assert errors[f"{share:g}"] <= 1.005 * min(errors.values())
-        assert json.loads(result.stdout)["completion_share"] == share
+        told = json.loads(result.stdout)
+        assert (told["completion_share"], told["spread_mm"]) == (share, manifest.discrepancy["spread_mm"])
+        spreads = manifest.calibration["cross_entropy_by_spread"]
+        assert float(min(spreads, key=spreads.__getitem__)) == manifest.discrepancy["spread_mm"]
+        before = (folder / "manifest.json").read_bytes()
+        assert run("calibrate", folder, "--masks", bundle.parent / "masks").exit_code == 0
+        assert (folder / "manifest.json").read_bytes() == before
 
     def test_a_model_without_one_has_no_weight_to_choose(self, run, bundle, tmp_path):
         plain = shutil.copytree(bundle, tmp_path / "plain")

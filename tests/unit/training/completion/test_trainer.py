@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from model.errors import InvalidParameter
 from model.geometry import Grid
 from tests.analytic_shapes import Ellipsoid
 from training.cohorts.cohort import Case
 from training.completion.samples import random_sample, windows_of
-from training.completion.trainer import SAVED_EVERY, CompletionConfig, completion_loss, train_completion
+from training.completion.trainer import CHECKPOINT, SAVED_EVERY, CompletionConfig, completion_loss, train_completion
 
 GRID = Grid((30, 30, 30), np.diag([1.0, 1.0, 1.0, 1.0]))
 MIDDLE = np.full(3, 14.5)
@@ -69,14 +70,18 @@ def test_a_training_that_was_ended_goes_on_to_the_same_network(tmp_path):
         torch.testing.assert_close(resumed.state_dict()[name], value, rtol=0.0, atol=0.0)
 
 
-def test_a_checkpoint_of_other_settings_is_not_gone_on_from(tmp_path):
-    config = replace(CONFIG, steps=2, width=4, batch=1)
-    steps = []
-    train_completion(WINDOWS, config, tmp_path, half=False)
-    train_completion(
-        WINDOWS, replace(config, seed=1), tmp_path, half=False, watch=lambda step, loss: steps.append(step)
-    )
-    assert steps == [1, 2]
+@pytest.mark.parametrize("other", [{"config": replace(CONFIG, steps=3, width=4, batch=1)}, {"masks": ("b",)}])
+def test_a_checkpoint_of_other_settings_or_masks_is_refused_and_stays(tmp_path, other):
+    made_of = {"config": replace(CONFIG, steps=2, width=4, batch=1), "masks": ("a",)}
+
+    def trained(config, masks):
+        train_completion(WINDOWS, config, tmp_path, masks=masks, half=False)
+
+    trained(**made_of)
+    before = (tmp_path / CHECKPOINT).read_bytes()
+    with pytest.raises(InvalidParameter, match="other masks or settings"):
+        trained(**{**made_of, **other})
+    assert (tmp_path / CHECKPOINT).read_bytes() == before
 
 
 class TestLoss:

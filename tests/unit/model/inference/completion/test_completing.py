@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from model.geometry import Pose
-from model.inference.completion.completing import PLACED_STEPS, completed, placed, weights_of
+from model.inference.completion.completing import PLACED_STEPS, completed, trust_in_place, weights_of
 from model.inference.discrepancy.conditioning import DiscrepancyPrior
 from model.inference.discrepancy.levels import saturated
 from model.inference.fitting import FitOptions, fit
@@ -89,7 +89,7 @@ class TestWhatBecomesOfIt:
         open_by_a_step = replace(known, precision=np.diag([1.0] * 3 + [LATTICE.step_mm**-2] * 3 + [1.0] * 4))
         sure, unsure = (completed(model, found, [STACK], OBSERVATIONS, SLOPE) for found in (known, open_by_a_step))
         np.testing.assert_allclose(unsure.shifts, PLACED_STEPS**2 * sure.shifts, atol=1e-6)
-        assert placed(known, LATTICE) == 1.0
+        assert trust_in_place(known, LATTICE) == 1.0
 
     def test_far_from_the_drawing_the_surface_lies_between_code_and_completion_and_on_it_at_the_contours(self):
         """The network says a ball of 12 mm, where the code says 9 and 7 mm; five planes hold both."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_of, with_discrepancy
+from model.inference.discrepancy.conditioning import corrected as under
 from model.inference.fitting import FitOptions, fit
 from model.inference.observations import Plane, find_planes, observe
 from model.inference.posterior import fitted_jacobians, fitted_logits, model_logits
@@ -54,6 +55,19 @@ def near_surface(points):
 
 def test_no_discrepancy_where_the_model_alone_is_trusted():
     assert discrepancy_of(MODEL, FOUND, [STACK], OBSERVATIONS, DiscrepancyPrior(fidelity=0.0)) is None
+
+
+@pytest.mark.parametrize("fidelity", [0.0, 0.3, 1.0])
+def test_another_prior_needs_no_other_observations(fidelity):
+    prior = DiscrepancyPrior(0.8, fidelity, (3.0, 10.0))
+    anew = discrepancy_of(MODEL, FOUND, [STACK], OBSERVATIONS, prior)
+    followed = under(MODEL, corrected(DiscrepancyPrior()), [STACK], OBSERVATIONS, prior).discrepancy
+    assert (anew is None) == (followed is None) == (fidelity == 0.0)
+    if anew is not None:
+        assert (followed.covariance, followed.noise_mm) == (anew.covariance, anew.noise_mm)
+        places = CENTRE - FOUND.pose.position + np.random.default_rng(0).uniform(-9.0, 9.0, (50, 3))
+        np.testing.assert_array_equal(followed.mean(places), anew.mean(places))
+        np.testing.assert_array_equal(followed.variance(places), anew.variance(places))
 
 
 def test_the_surface_follows_the_drawn_slices():
