@@ -221,6 +221,13 @@ def complete(
     bundle: Annotated[Path, typer.Argument(help="Folder of an exported bundle; the network is put into it.")],
     run: Annotated[Path | None, typer.Option(help="Folder of the checkpoint, from which training goes on.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps.")] = None,
+    reflect: Annotated[
+        bool | None,
+        typer.Option(
+            "--reflect/--no-reflect",
+            help="Whether it learns from mirror images as well; it does for structures with both sides or none.",
+        ),
+    ] = None,
     device: Annotated[DeviceName, typer.Option(help="Where to compute.")] = DeviceName.AUTO,
     as_json: JsonOption = False,
 ) -> None:
@@ -237,6 +244,7 @@ def complete(
                 bundle,
                 found,
                 folder,
+                reflect=reflect,
                 steps=steps,
                 seed=options.seed,
                 device=resolved(device),

@@ -18,12 +18,18 @@ from training.runs import mask_digest
 MOST_VOXELS, LEAST_STEP_MM = 110_000, 1.0
 
 
-def completion_config(cohort: Cohort, windows: Sequence[Window], steps: int | None, seed: int) -> CompletionConfig:
-    """The configuration for a cohort; mirror images are among the samples where both sides are among the masks."""
+def completion_config(
+    cohort: Cohort, windows: Sequence[Window], *, reflect: bool | None, steps: int | None, seed: int
+) -> CompletionConfig:
+    """The configuration for a cohort.
+
+    Args:
+        reflect: whether every other sample is a mirror image; where the cohort says that it has both sides, or none,
+            when None.
+    """
+    reflected = cohort.side in ("mixed", "unpaired") if reflect is None else reflect
     lattice = lattice_for(windows, MOST_VOXELS, LEAST_STEP_MM, MULTIPLE)
-    config = CompletionConfig(
-        lattice.voxels, lattice.step_mm, reflected=cohort.side in ("mixed", "unpaired"), seed=seed
-    )
+    config = CompletionConfig(lattice.voxels, lattice.step_mm, reflected=reflected, seed=seed)
     return config if steps is None else replace(config, steps=steps)
 
 
@@ -32,6 +38,7 @@ def complete_bundle(
     cohort: Cohort,
     run: Path,
     *,
+    reflect: bool | None = None,
     steps: int | None = None,
     seed: int = 0,
     device: str = "cpu",
@@ -41,6 +48,7 @@ def complete_bundle(
 
     Args:
         run: folder of the training's checkpoint, from which it goes on.
+        reflect, steps: as in `completion_config`; `CompletionConfig`'s when None.
 
     Raises:
         BundleError: the bundle cannot be trusted.
@@ -49,7 +57,7 @@ def complete_bundle(
     """
     manifest, _ = read_manifest(folder)
     windows = windows_of(cohort.train)
-    config = completion_config(cohort, windows, steps, seed)
+    config = completion_config(cohort, windows, reflect=reflect, steps=steps, seed=seed)
     masks = [mask_digest(case) for case in cohort.train]
     net = train_completion(windows, config, run, masks=masks, device=device, watch=watch)
     written = export_completion(net, folder)
