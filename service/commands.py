@@ -90,7 +90,7 @@ def reconstruct(
     with progress(STEPS) as watch:
         watch("masks")
         stacks = _read(settings, masks, parse_labels(label or []))
-        outcome = use_cases.reconstruct(registry.get(model), stacks, options, watch)
+        outcome = use_cases.reconstruct(registry.get(model), stacks, options, settings.max_voxels, watch)
         _write_mesh(outcome, output, format, max_error_mm)
         _write_volume(registry, outcome, segmentation, use_cases.segmentation, settings.max_voxels)
         _write_volume(registry, outcome, entropy, use_cases.entropy_map, settings.max_voxels)

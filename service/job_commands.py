@@ -13,6 +13,7 @@ from model.errors import InvalidParameter
 from model.inference.calipers import USUAL_TEXT, parse_extents
 from model.inference.fitting import MirrorRule
 from model.inference.reconstruction import UncertaintyRule
+from model.inference.surface import require_step
 from service import use_cases
 from service.commands import ExtentsOption, FidelityOption, ForceOption, JsonOption, ModelOption, RejectOption
 from service.console import bar, echo_json, require_free
@@ -68,7 +69,7 @@ def sample_job(
     settings = load_settings()
     chosen = context.obj(settings).get(model)
     use_cases.batch_seeds(seed, count, settings.max_job_samples)
-    use_cases.require_step(chosen, spacing_mm, settings.max_voxels)
+    require_step(chosen, spacing_mm, settings.max_voxels)
     argument = {
         "model": pinned_name(chosen),
         "count": count,
@@ -103,8 +104,10 @@ def reconstruct_job(
     require_free({"--output": output}, force=force)
     parse_annotated(annotated), parse_labels(label or []), parse_extents(extents)
     settings = load_settings()
+    chosen = context.obj(settings).get(model)
+    require_step(chosen, resolution_mm, settings.max_voxels, part="resolution_mm")
     argument = {
-        "model": pinned_name(context.obj(settings).get(model)),
+        "model": pinned_name(chosen),
         "format": format.value,
         "label": label or [],
         "annotated": annotated,

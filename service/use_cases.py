@@ -21,7 +21,7 @@ from model.inference.posterior_shapes import PosteriorShape, draw_posterior
 from model.inference.reconstruction import Options, Watch
 from model.inference.reconstruction import reconstruct as infer
 from model.inference.sampling import SampledShape, draw_shape
-from model.inference.surface import covering_grid
+from model.inference.surface import covering_grid, require_step
 from model.inference.uncertainty import ShapeState, occupancy, voxel_entropy
 from model.interruption import Check, interruptible
 from service.errors import NotComputed
@@ -39,19 +39,21 @@ def reconstruct(
     model: ShapeModel,
     stacks: tuple[MaskStack, ...],
     options: Options,
+    max_voxels: int | None = None,
     watch: Watch = lambda stage: None,
     check: Check = lambda: None,
 ) -> Outcome:
     """Reconstruct the object of the stacks; the first one's grid is the input's grid.
 
     Args:
+        max_voxels: of the grid in which the surface is looked for; any number when None.
         watch: told the name of each stage as it begins.
         check: called many times a second; what it raises ends the work.
 
     Raises:
         InputError: the stacks or options cannot be used; the sentence says why.
     """
-    reconstruction = infer(interruptible(model, check), stacks, options, watch)
+    reconstruction = infer(interruptible(model, check), stacks, options, watch, max_voxels)
     manifest = model.manifest
     return Outcome(manifest.name, manifest.version, model.digest, options, stacks[0].grid, reconstruction)
 
@@ -152,7 +154,8 @@ def posterior(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, 
     _require_uncertainty(outcome)
     model = _same_model(catalogue, outcome)
     step = outcome.options.resolution_mm if spacing_mm is None else spacing_mm
-    require_step(model, step, max_voxels)
+    log_scale = outcome.reconstruction.state.fits[0].pose.log_scale
+    require_step(model, step, max_voxels, log_scale=log_scale)
     return Posterior(model, outcome, step)
 
 
@@ -173,13 +176,6 @@ def draw(
     """
     require_step(model, spacing_mm, max_voxels)
     return draw_shape(model, seed, temperature=temperature, spacing_mm=spacing_mm, reject=reject)
-
-
-def require_step(model: ShapeModel, spacing_mm: float | None, max_voxels: int) -> None:
-    """Refuse a spacing at which the model's box has more voxels than allowed."""
-    step = model.manifest.resolution_mm if spacing_mm is None else spacing_mm
-    if step > 0 and np.prod([np.ceil(2 * half / step) + 1 for half in model.manifest.half_extent_mm]) > max_voxels:
-        raise _too_many_voxels(max_voxels)
 
 
 def batch_seeds(seed: int, count: int, max_count: int, beyond: str = "") -> range:
@@ -263,8 +259,9 @@ def way_between(
     if outcome.model_digest != other.model_digest:
         raise InvalidParameter("Two models made the results; results of one model are accepted.", part="with")
     model = _same_model(catalogue, outcome)
-    require_step(model, spacing_mm, max_voxels)
-    return Way(model, outcome.reconstruction.state.fits[0], other.reconstruction.state.fits[0], spacing_mm)
+    start, end = outcome.reconstruction.state.fits[0], other.reconstruction.state.fits[0]
+    require_step(model, spacing_mm, max_voxels, log_scale=start.pose.log_scale)
+    return Way(model, start, end, spacing_mm)
 
 
 def describe(catalogue: Catalogue) -> Iterator[ShapeModel]:
@@ -275,13 +272,10 @@ def describe(catalogue: Catalogue) -> Iterator[ShapeModel]:
 def require_voxels(grid: Grid, max_voxels: int) -> None:
     """Refuse a grid with more voxels than allowed, before anything of its size is made."""
     if np.prod([float(count) for count in grid.shape]) > max_voxels:
-        raise _too_many_voxels(max_voxels)
-
-
-def _too_many_voxels(max_voxels: int) -> TooLarge:
-    return TooLarge(
-        f"The parameter spacing_mm asks for more than {max_voxels} voxels; ask for a coarser one.", part="spacing_mm"
-    )
+        raise TooLarge(
+            f"The parameter spacing_mm asks for more than {max_voxels} voxels; ask for a coarser one.",
+            part="spacing_mm",
+        )
 
 
 def _same_model(catalogue: Catalogue, outcome: Outcome) -> ShapeModel:

@@ -22,7 +22,7 @@ from model.inference.observations import AnnotatedRule, MaskStack, Observations,
 from model.inference.posterior import FieldDerivatives, fitted_logits, laplace_covariance
 from model.inference.reliability import figures_of, less_trusting, reliability_warnings, thickness_warnings
 from model.inference.rivals import rival_warnings
-from model.inference.surface import differentiated_surface, surface_of
+from model.inference.surface import differentiated_surface, require_step, surface_of
 from model.inference.thick_slices import through_thickness
 from model.inference.typicality import (
     predictive_probabilities,
@@ -121,16 +121,25 @@ def farthest_mm(model: ShapeModel) -> float:
 
 
 def reconstruct(
-    model: ShapeModel, stacks: Sequence[MaskStack], options: Options, watch: Watch = lambda stage: None
+    model: ShapeModel,
+    stacks: Sequence[MaskStack],
+    options: Options,
+    watch: Watch = lambda stage: None,
+    max_voxels: int | None = None,
 ) -> Reconstruction:
     """Fit the model to the stacks and extract surface and uncertainty.
+
+    Args:
+        max_voxels: of the grid in which the surface is looked for; any number when None.
 
     Raises:
         InvalidMask: no foreground, or everything in one plane.
         InconsistentStacks: the stacks cannot be of one object.
         InvalidParameter: an option out of its range.
+        TooLarge: the grid of the surface has more voxels than allowed.
     """
     _check(options)
+    _require_room(model, options, max_voxels)
     watch("observations")
     planes = find_planes(stacks, options.annotated, farthest_mm(model))
     drawing = observe(stacks, planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=options.seed)
@@ -139,6 +148,7 @@ def reconstruct(
     model, settled, observations = _settled(model, stacks, drawing, FitOptions(mirror=options.mirror), usual)
     found = corrected(model, settled, stacks, drawing, discrepancy_prior(model.manifest, options.fidelity))
     watch("surface")
+    _require_room(model, options, max_voxels, found)
     mesh, derivatives = _surface(model, found, options)
     if mesh.is_empty:
         raise InvalidMask(
@@ -198,6 +208,13 @@ def _surface(model: ShapeModel, found: Fit, options: Options) -> tuple[Mesh, Fie
     if options.uncertainty == "none":
         return surface_of(model, found.latent, found.pose, options.resolution_mm, found.discrepancy), None
     return differentiated_surface(model, found, options.resolution_mm)
+
+
+def _require_room(model: ShapeModel, options: Options, max_voxels: int | None, found: Fit | None = None) -> None:
+    """Refuse a step that is too fine for the model's own size, or for the size that was found."""
+    if max_voxels is not None:
+        log_scale = 0.0 if found is None else found.pose.log_scale
+        require_step(model, options.resolution_mm, max_voxels, part="resolution_mm", log_scale=log_scale)
 
 
 def _check(options: Options) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from model.bundle import ShapeModel
-from model.errors import InvalidParameter
+from model.errors import InvalidParameter, TooLarge
 from model.geometry import Grid, Pose
 from model.inference.discrepancy.process import Discrepancy
 from model.inference.fitting import Fit
@@ -16,6 +16,8 @@ from model.inference.posterior import FieldDerivatives, field_derivatives
 BOX_MARGIN_MM = 6.0
 #: Accepted grid steps (mm) of a surface that a caller chooses.
 SPACING_RANGE_MM = (0.25, 10.0)
+#: Points that are evaluated at a time: few enough that whoever wants the work ended waits some tenths of a second.
+POINTS_AT_A_TIME = 1 << 16
 
 
 def surface_of(
@@ -37,11 +39,15 @@ def surface_of(
         keep_specks: keep all components; only the one of largest volume otherwise.
     """
 
-    def gradient(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+    def piece(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
         logits, by_point = (part[0] for part in model.decoder.logits_and_gradients(latent[None], points[None]))
         if discrepancy is None:
             return logits, by_point
         return discrepancy.corrected_with_gradient(logits, by_point, points)
+
+    def gradient(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+        values, slopes = zip(*map(piece, _pieces(points)), strict=True)
+        return np.concatenate(values), np.concatenate(slopes)
 
     return _extracted(model, latent, pose, step_mm, discrepancy, gradient, keep_specks=keep_specks)
 
@@ -80,15 +86,23 @@ def _extracted(
     half = canonical_box(model)
     step = (step_mm or model.manifest.resolution_mm) * float(np.exp(pose.log_scale))
 
-    def field(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def piece(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         logits = model.decoder.logits(latent[None], points[None])[0]
         return logits if discrepancy is None else discrepancy.corrected(logits, points)
+
+    def field(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        return np.concatenate([piece(points) for points in _pieces(points)])
 
     mesh = extract_surface(field, -half, half, step, gradient=gradient, keep_specks=keep_specks)
     affine = np.eye(4)
     affine[:3, :3] = np.linalg.inv(pose.linear)
     affine[:3, 3] = pose.position
     return transformed(mesh, affine)
+
+
+def _pieces(points: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "m 3"]]:
+    """Equal parts of at most `POINTS_AT_A_TIME` points; one at least."""
+    return np.array_split(points, max(-(-len(points) // POINTS_AT_A_TIME), 1))
 
 
 def canonical_box(model: ShapeModel) -> Float[np.ndarray, "3"]:
@@ -107,6 +121,28 @@ def require_spacing(spacing_mm: float | None) -> None:
         raise InvalidParameter(
             f"spacing_mm is {spacing_mm:g}; a grid step from {low:g} to {high:g} mm is accepted.", part="spacing_mm"
         )
+
+
+def require_step(
+    model: ShapeModel, step_mm: float | None, max_voxels: int, *, part: str = "spacing_mm", log_scale: float = 0.0
+) -> None:
+    """Refuse a grid step at which the model's box has more voxels than allowed.
+
+    Args:
+        step_mm: in world mm; the model's own when None.
+        part: how the caller knows the step.
+        log_scale: of the object's pose; a larger object than the model's needs as many more steps along each axis.
+
+    Raises:
+        TooLarge: it has.
+    """
+    scale = float(np.exp(log_scale))
+    step = (model.manifest.resolution_mm if step_mm is None else step_mm) * scale
+    if not step > 0 or np.prod([np.ceil(2 * half / step) + 1 for half in model.manifest.half_extent_mm]) <= max_voxels:
+        return
+    size = f" for an object {1.0 / scale:.2g} times as large as the model's" if log_scale < 0 else ""
+    sentence = f"The parameter {part} asks for more than {max_voxels} voxels{size}; ask for a coarser one."
+    raise TooLarge(sentence, part=part)
 
 
 def covering_grid(mesh: Mesh, spacing_mm: float, margin_mm: float = 5.0) -> Grid:

@@ -151,7 +151,7 @@ def _reconstruct(tools: DrawingTools, item: Record, check: Check) -> Record:
     labels = None if item["labels"] is None else frozenset(item["labels"])
     stacks = stacks_of_object(drawing, "object", tools.limits, labels, series.grid)
     model = tools.registry.get(rule.model)
-    outcome = use_cases.reconstruct(model, stacks, _options(rule), check=check)
+    outcome = use_cases.reconstruct(model, stacks, _options(rule), tools.limits.max_voxels, check=check)
     outcome = replace(outcome, grid=series.grid)
     key = _key(str(drawing.SOPInstanceUID), outcome, labels)
     derivation = Derivation(drawing, series, outcome, anatomy_of(model.manifest), key, tools.version)

@@ -133,4 +133,4 @@ def _reconstruct(tools: JobTools, item: Record, sources: list[bytes], check: Che
     stacks = tuple(
         stack for number, data in enumerate(sources) for stack in tools.read_mask(data, f"mask[{number}]", labels)
     )
-    return use_cases.reconstruct(model, stacks, options, check=check)
+    return use_cases.reconstruct(model, stacks, options, tools.max_voxels, check=check)

@@ -9,6 +9,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
 from zipstream import ZipStream  # type: ignore[import-untyped]
 
+from model.inference.surface import require_step
 from service import use_cases
 from service.errors import Cancelled, NotReady
 from service.job_files import JobFiles
@@ -97,8 +98,7 @@ def create_job(
 ) -> Response:
     """Answers at once; the work is done by other processes and goes on after a restart."""
     argument = form.argument(submittable_model(services, form.model))
-    if form.kind == SAMPLES_JOB:
-        _require_drawable(services, argument)
+    _require_feasible(services, form.kind, argument)
     inputs = [] if form.archive is None else [form.archive.file.read()]
     return accepted_job(request, submit(services, form.kind, argument, inputs, key))
 
@@ -164,7 +164,9 @@ def _zip(job: JobFiles, kind: str, count: int) -> Iterator[bytes]:
     yield from archive.finalize()
 
 
-def _require_drawable(services: Services, argument: dict[str, Any]) -> None:
-    use_cases.batch_seeds(argument["seed"], argument["count"], services.settings.max_job_samples)
-    model = services.registry.get(argument["model"])
-    use_cases.require_step(model, argument["spacing_mm"], services.settings.max_voxels)
+def _require_feasible(services: Services, kind: str, argument: dict[str, Any]) -> None:
+    limits = services.settings
+    if kind == SAMPLES_JOB:
+        use_cases.batch_seeds(argument["seed"], argument["count"], limits.max_job_samples)
+    step = "spacing_mm" if kind == SAMPLES_JOB else "resolution_mm"
+    require_step(services.registry.get(argument["model"]), argument[step], limits.max_voxels, part=step)

@@ -10,6 +10,7 @@ from starlette.responses import JSONResponse, Response
 from model.errors import InvalidParameter, TooLarge, UnknownModel
 from model.inference.observations import MaskStack
 from model.inference.reconstruction import Watch
+from model.inference.surface import require_step
 from service import use_cases
 from service.observability import StageTimer
 from service.ports import RECONSTRUCTION_JOB, MeshFormat, StoredResult
@@ -92,8 +93,10 @@ async def create_reconstruction(
 
 def _enqueue(request: Request, services: Services, form: ReconstructionForm, key: str | None) -> Response:
     model = submittable_model(services, form.model)
-    form.options()
+    options = form.options()
     parse_labels(form.label)
+    step, limit = options.resolution_mm, services.settings.max_voxels
+    require_step(services.registry.get(model), step, limit, part="resolution_mm")
     argument = form.model_dump(exclude={"mask", "model"}) | {"model": model, "masks": len(form.mask)}
     inputs = [mask.file.read() for mask in form.mask]
     return accepted_job(request, submit(services, RECONSTRUCTION_JOB, argument, inputs, key))
@@ -101,6 +104,7 @@ def _enqueue(request: Request, services: Services, form: ReconstructionForm, key
 
 def _reconstruct(services: Services, form: ReconstructionForm, watch: Watch) -> StoredResult:
     options, labels = form.options(), parse_labels(form.label)
+    max_voxels = services.settings.max_voxels
     try:
         model = services.registry.get(form.model)
     except UnknownModel as error:
@@ -113,7 +117,7 @@ def _reconstruct(services: Services, form: ReconstructionForm, watch: Watch) -> 
         timer(stage)
 
     check = partial(watch, "evaluation")
-    outcome = services.compute(use_cases.reconstruct, model, stacks, options, watch=observed, check=check)
+    outcome = services.compute(use_cases.reconstruct, model, stacks, options, max_voxels, watch=observed, check=check)
     timer.finish()
     return services.store.save(outcome)
 

@@ -11,6 +11,7 @@ from zipstream import ZipStream  # type: ignore[import-untyped]
 
 from model.bundle import ShapeModel
 from model.inference.reconstruction import Watch
+from model.inference.surface import require_step
 from service import use_cases
 from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, make_sample, manifest_bytes
 from service.ports import SampleFormat, Ticket
@@ -76,7 +77,7 @@ async def read_batch(
     beyond = f" here; a job of kind samples takes up to {limits.max_job_samples}"
     seeds = use_cases.batch_seeds(query.seed, query.count, limits.max_samples, beyond)
     how = _draw(services, query)
-    use_cases.require_step(model, how.spacing_mm, how.max_voxels)
+    require_step(model, how.spacing_mm, how.max_voxels)
     writer = SampleWriter(services.write_mesh, services.write_volume)
     works = (partial(services.compute, make_sample, model, writer, seed, how) for seed in seeds)
     chunks = _zip_chunks(model, how, works, ticket, services.settings.workers + 1)

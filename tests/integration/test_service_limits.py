@@ -59,13 +59,27 @@ def test_too_many_masks_are_refused(tmp_path):
 
 
 def test_an_answer_of_too_many_voxels_is_refused(tmp_path):
-    with running(app_for(tmp_path, max_voxels=40_000)) as client:
+    with running(app_for(tmp_path, max_voxels=50_000)) as client:
         created = client.post(RECONSTRUCTIONS, files=mask_parts())
         assert created.status_code == 201
         fine = client.get(f"{created.json()['links']['segmentation']}?spacing_mm=0.25")
         assert problem(fine, 413)["part"] == "spacing_mm"
         for path in (f"{SAMPLES}/1", SAMPLES):
             assert problem(client.get(path, params={"spacing_mm": 0.25}), 413)["part"] == "spacing_mm"
+
+
+def test_a_surface_of_too_many_voxels_is_refused_at_once(tmp_path):
+    with running(app_for(tmp_path, max_voxels=50_000)) as client:
+        asked = {"resolution_mm": "0.25"}
+        archive = {"kind": (None, "reconstructions"), "resolution_mm": (None, "0.25"), "archive": ("a.zip", b"")}
+        for answer in (
+            client.post(RECONSTRUCTIONS, files=mask_parts(), data=asked),
+            client.post(RECONSTRUCTIONS, files=mask_parts(), data=asked, headers={"Prefer": "respond-async"}),
+            client.post("/v1/jobs", files=archive),
+        ):
+            told = problem(answer, 413)
+            assert told["part"] == "resolution_mm"
+            assert "resolution_mm" in told["detail"]
 
 
 def test_a_mask_of_too_many_voxels_is_refused(tmp_path):

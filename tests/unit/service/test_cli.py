@@ -107,6 +107,13 @@ def test_bad_options_end_with_status_2(mask, words, capsys, monkeypatch):
     assert "Traceback" not in told.err
 
 
+@pytest.mark.parametrize("words", [("reconstruct",), ("jobs", "reconstruct")])
+def test_a_surface_of_too_many_voxels_is_refused(mask, words, capsys, monkeypatch):
+    monkeypatch.setenv("MORPHOFLOW_MAX_VOXELS", "50000")
+    assert run(*words, mask, "--resolution-mm", "0.25") == BAD_INPUT
+    assert "resolution_mm" in capsys.readouterr().err
+
+
 def test_a_mask_that_is_not_there_is_named_by_its_number(mask, tmp_path, capsys):
     assert run("reconstruct", mask, tmp_path / "absent.nii") == BAD_INPUT
     told = capsys.readouterr().err

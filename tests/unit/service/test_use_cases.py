@@ -77,6 +77,25 @@ def test_uncertainty_that_was_not_asked_for_is_not_made_up(registry):
 def test_the_voxel_limit_holds_for_the_models_box(spacing_mm):
     model = ellipsoid_model(NAME)
     needed = int(np.prod([np.ceil(2 * half / spacing_mm) + 1 for half in model.manifest.half_extent_mm]))
-    use_cases.require_step(model, spacing_mm, needed)
+    use_cases.draw(model, 1, 1.0, spacing_mm, needed)
     with pytest.raises(TooLarge):
-        use_cases.require_step(model, spacing_mm, needed - 1)
+        use_cases.draw(model, 1, 1.0, spacing_mm, needed - 1)
+
+
+def test_what_is_drawn_around_a_large_object_keeps_the_voxel_limit_too(registry):
+    needed = int(np.prod([np.ceil(2 * half) + 1 for half in registry.get(NAME).manifest.half_extent_mm]))
+    for size, refused in ((0.5, False), (1.0, False), (12.0, True)):
+        outcome = sized(outcome_of(), size)
+        for ask in (use_cases.posterior, lambda *values: use_cases.way_between(values[0], values[1], *values[1:])):
+            if refused:
+                with pytest.raises(TooLarge, match="12 times as large"):
+                    ask(registry, outcome, 1.0, needed)
+            else:
+                ask(registry, outcome, 1.0, needed)
+
+
+def sized(outcome, size):
+    """The outcome for an object so many times as large as the model's."""
+    answer = outcome.reconstruction
+    fits = tuple(replace(fit, pose=replace(fit.pose, log_scale=-np.log(size))) for fit in answer.state.fits)
+    return replace(outcome, reconstruction=replace(answer, state=replace(answer.state, fits=fits)))

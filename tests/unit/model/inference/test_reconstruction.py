@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.errors import InvalidMask, InvalidParameter
+from model.errors import InvalidMask, InvalidParameter, TooLarge
 from model.geometry import Grid, Pose
 from model.inference.mesh import area_cm2, is_watertight, volume_ml
 from model.inference.observations import MaskStack, Plane, section_of
@@ -275,3 +275,21 @@ def test_empty_planes_that_stay_empty_agree():
     residuals = {residual.plane.index: residual.disagreement for residual in answer.residuals}
     assert residuals[2] == residuals[38] == 0.0
     assert answer.warnings == ()
+
+
+@pytest.mark.parametrize("uncertainty", ["none", "laplace"])
+def test_the_voxel_limit_holds_at_the_size_that_was_found(uncertainty):
+    needed = int(np.prod([np.ceil(2 * half) + 1 for half in MODEL.manifest.half_extent_mm]))
+    options, stack = Options(uncertainty=uncertainty), drawn(ELLIPSOID, cube_around(CENTRE))
+    assert not reconstruct(MODEL, [stack], options, max_voxels=2 * needed).mesh.is_empty
+    large = replace(stack, grid=Grid(stack.grid.shape, stack.grid.affine @ np.diag([6.0, 6.0, 6.0, 1.0])))
+    with pytest.raises(TooLarge, match="times as large as the model's") as refused:
+        reconstruct(MODEL, [large], options, max_voxels=2 * needed)
+    assert refused.value.part == "resolution_mm"
+
+
+def test_a_step_too_fine_for_the_models_own_size_is_refused_before_anything_is_done():
+    told = []
+    with pytest.raises(TooLarge, match="resolution_mm"):
+        reconstruct(MODEL, [drawn(ELLIPSOID, cube_around(CENTRE))], Options(resolution_mm=0.5), told.append, 10_000)
+    assert told == []

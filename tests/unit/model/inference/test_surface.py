@@ -8,9 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.geometry import Pose
+from model.inference import surface
 from model.inference.mesh import area_cm2, extents, is_watertight, volume_ml
 from model.inference.posterior import fitted_jacobians
 from model.inference.surface import BOX_MARGIN_MM, canonical_box, covering_grid, differentiated_surface, surface_of
+from model.interruption import interruptible
 from tests import few_planes
 from tests.analytic_model import STEEPNESS, EllipsoidDecoder, bent_model, ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
@@ -153,3 +155,15 @@ def test_nothing_has_no_derivatives():
     mesh, derivatives = differentiated_surface(MODEL, found)
     assert mesh.is_empty
     assert derivatives is None
+
+
+def test_what_ends_the_work_is_asked_after_every_few_points(monkeypatch):
+    told = []
+    model = interruptible(MODEL, lambda: told.append(None))
+    whole = surface_of(model, LATENT, POSE)
+    few = len(told)
+    monkeypatch.setattr(surface, "POINTS_AT_A_TIME", 100)
+    pieces = surface_of(model, LATENT, POSE)
+    assert len(told) - few > len(pieces.vertices) / 100
+    np.testing.assert_array_equal(pieces.faces, whole.faces)
+    np.testing.assert_allclose(pieces.vertices, whole.vertices, atol=1e-9)

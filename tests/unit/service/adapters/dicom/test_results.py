@@ -33,7 +33,7 @@ def derive(images, key: str = "the same"):
     drawn, _ = sparse_ellipsoid(shape=series.grid.shape)
     drawing = reread(seg_of(images, drawn))
     stacks = stacks_of_object(drawing, "mask[0]", LIMITS, home=series.grid)
-    outcome = use_cases.reconstruct(model, stacks, Options(), lambda stage: None)
+    outcome = use_cases.reconstruct(model, stacks, Options())
     derivation = Derivation(drawing, series, outcome, anatomy_of(model.manifest), key, "0.1.0")
     volume = use_cases.probability_map(ModelRegistry({"ellipsoid": model}), outcome, None, 1 << 22)
     return derivation, volume.array
