@@ -1,7 +1,8 @@
 """Frames, voxel grids and similarity poses.
 
-World coordinates are RAS in mm. The canonical frame of a model is RAS in mm as well, with its
-origin at the mean centroid of the training shapes. A `Pose` takes world points into that frame:
+World coordinates are RAS in mm; only what is told to others may be in LPS, the patient coordinates
+of DICOM. The canonical frame of a model is RAS in mm as well, with its origin at the mean centroid of
+the training shapes. A `Pose` takes world points into that frame:
 
     u = exp(s) R F (x - t)
 
@@ -10,17 +11,25 @@ log scale ``s`` and ``F = diag(-1, 1, 1)`` for mirrored anatomy, identity otherw
 """
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+#: Worlds in which coordinates are told.
+Space = Literal["RAS", "LPS"]
 #: Two directions count as perpendicular when their cosine is below this (about 0.06 degrees).
 SHEAR_TOLERANCE = 1e-3
 #: Grids coincide when their corners lie within this distance (mm).
 COINCIDENCE_TOLERANCE_MM = 1e-2
 #: Position, rotation and log scale.
 POSE_SIZE = 7
+
+
+def ras_to(space: Space) -> Float[np.ndarray, "3 3"]:
+    """Points and directions of RAS to a space, and back: it is its own inverse, and a rotation."""
+    return np.diag([-1.0, -1.0, 1.0]) if space == "LPS" else np.eye(3)
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,9 @@ TITLE = "MorphoFlow"
 #: Of the interface, not of the program: the second figure rises with additions, the first with breaks.
 INTERFACE_VERSION = "1.0.0"
 DESCRIPTION = (
-    "Complete 3-D anatomy, with its uncertainty, from a few annotated slices. Lengths are mm, coordinates RAS in the "
-    "input's own world. Errors are problems (RFC 9457)."
+    "Complete 3-D anatomy, with its uncertainty, from a few annotated slices. Lengths are mm, coordinates those of the "
+    "input's own world, which `space` names: LPS where all masks are DICOM, RAS otherwise. Errors are problems (RFC "
+    "9457)."
 )
 
 

@@ -157,7 +157,7 @@ def _write_mesh(outcome: Outcome, path: Path | None, format: str, max_error_mm: 
         return
     metadata = {"model": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest}
     mesh = decimated(outcome.reconstruction.mesh, max_error_mm)
-    path.write_bytes(write_mesh(mesh, format, space="RAS", metadata=metadata))
+    path.write_bytes(write_mesh(mesh, format, space=outcome.reconstruction.space, metadata=metadata))
 
 
 def _write_volume(

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from model.bundle import ShapeModel
+from model.geometry import Space, ras_to
 from model.inference.estimates import Estimate, sd_of_estimate
 from model.inference.mask_stack import MaskStack, Plane, section_of
 from model.inference.next_plane import NextPlane
@@ -38,13 +39,15 @@ from service.use_cases import SURFACE_SD
 
 
 def summary_of(outcome: Outcome) -> Summary:
-    """The wire form of an outcome."""
+    """The wire form of an outcome, in the input's world."""
     answer = outcome.reconstruction
+    space = answer.space
     fit = answer.state.fits[0]
     pose = fit.pose
     sd = answer.mesh.scalars.get(SURFACE_SD)
     return Summary(
         model=ModelReference(name=outcome.model_name, version=outcome.model_version, digest=outcome.model_digest),
+        space=space,
         fit=FitSchema(
             status=fit.status.value,
             converged=fit.status.value == "converged",
@@ -52,8 +55,8 @@ def summary_of(outcome: Outcome) -> Summary:
             iterations=fit.iterations,
         ),
         pose=PoseSchema(
-            position_mm=pose.position.tolist(),
-            rotation=pose.rotation.tolist(),
+            position_mm=_told(pose.position, space),
+            rotation=[_told(row, space) for row in pose.rotation],
             scale=math.exp(pose.log_scale),
             mirrored=pose.mirrored,
         ),
@@ -73,7 +76,7 @@ def summary_of(outcome: Outcome) -> Summary:
         volume_ml=_estimate(answer.volume_ml),
         area_cm2=_estimate(answer.area_cm2),
         extents=[
-            ExtentSchema(along=e.along, direction=list(e.direction), extent_mm=_estimate(e.extent_mm))
+            ExtentSchema(along=e.along, direction=_told(np.array(e.direction), space), extent_mm=_estimate(e.extent_mm))
             for e in answer.extents
         ],
         surface_sd=None if sd is None else _surface_sd(sd),
@@ -122,15 +125,16 @@ def drawn_planes(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> DrawnP
 
 
 def next_plane_summary(outcome: Outcome, found: NextPlane) -> NextPlaneSchema:
-    """The wire form of the plane to draw next, of an outcome with uncertainty."""
+    """The wire form of the plane to draw next, of an outcome with uncertainty, in the input's world."""
     answer = outcome.reconstruction
     sd = float(answer.mesh.scalars[SURFACE_SD].mean())
     volume = sd_of_estimate(answer.volume_ml)
     plane = found.cut.plane
     return NextPlaneSchema(
+        space=answer.space,
         plane=None if plane is None else _plane(plane),
-        origin_mm=found.cut.origin.tolist(),
-        normal=found.cut.normal.tolist(),
+        origin_mm=_told(found.cut.origin, answer.space),
+        normal=_told(found.cut.normal, answer.space),
         surface_sd_mm=GainSchema(now=sd, expected=sd * found.surface_share),
         volume_sd_ml=GainSchema(now=volume, expected=volume * found.volume_share),
         considered=found.considered,
@@ -169,6 +173,12 @@ def model_description(model: ShapeModel, address: str) -> ModelDescription:
         attribution=manifest.attribution,
         accuracy=manifest.accuracy,
     )
+
+
+def _told(values: Float[np.ndarray, "3"], space: Space) -> list[float]:
+    """A point, a direction or a row of a matrix over RAS, for readers of a space; without a negative zero."""
+    told: list[float] = (ras_to(space) @ values + 0.0).tolist()
+    return told
 
 
 def _runs(section: Bool[np.ndarray, "a b"]) -> list[list[int]]:

@@ -7,6 +7,7 @@ from fastapi import UploadFile
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from model.errors import InvalidParameter
+from model.geometry import Space
 from model.inference.calipers import USUAL_TEXT, parse_extents
 from model.inference.next_plane import Among
 from model.inference.observations import AnnotatedRule, Plane
@@ -17,9 +18,13 @@ from service.use_cases import MAX_SEED
 SpacingMm = Annotated[float, Field(ge=0.25, le=10.0, allow_inf_nan=False, description="grid step (mm)")]
 #: Description of the part `extents`.
 EXTENTS = (
-    "extents of the surface to measure, separated by commas: R, A and S along the axes of the world, longest between "
-    "any two points, or a direction as three numbers with blanks between them, such as 0.5 0 0.87"
+    "extents of the surface to measure, separated by commas: R, A and S along the axes of the body, longest between "
+    "any two points, or a direction of the input's world as three numbers with blanks between them, such as 0.5 0 0.87"
 )
+#: World of a mesh that is asked for.
+AskedSpace = Annotated[
+    Space | None, Field(description="world of the coordinates, RAS or LPS; the input's when left out")
+]
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED, description="makes the answer repeatable")]
 
 
@@ -79,12 +84,14 @@ class ComparisonQuery(_Closed):
 
     other: str = Field(description="identifier of the result that is compared with")
     format: Literal["ply", "glb", "vtp", "mz3"] = Field("ply", description="file format")
+    space: AskedSpace = None
 
 
 class MeshQuery(_Closed):
     """Query of a mesh."""
 
     format: MeshFormat = Field(MeshFormat.PLY, description="file format")
+    space: AskedSpace = None
     max_error_mm: float = Field(
         0.0, ge=0.0, le=10.0, description="fewer triangles, none of them farther than this (mm) from the full surface"
     )

@@ -1,11 +1,17 @@
 """Wire types of the HTTP interface's answers; units stand in the names of the fields. They stop at the routes."""
 
 from datetime import datetime
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
+from model.geometry import Space
 from service.request_schemas import PlaneSchema
+
+#: World of an answer's coordinates.
+InputSpace = Annotated[
+    Space, Field(description="world of the coordinates, the input's own: LPS where all masks were DICOM, RAS otherwise")
+]
 
 
 class StackSchema(BaseModel):
@@ -25,7 +31,7 @@ class DrawnPlaneSchema(PlaneSchema):
 
 
 class DrawnPlanes(BaseModel):
-    """What a reconstruction reads of masks; coordinates are RAS in mm."""
+    """What a reconstruction reads of masks; coordinates are RAS in mm, of DICOM objects too."""
 
     space: Literal["RAS"] = "RAS"
     unit: Literal["mm"] = "mm"
@@ -45,7 +51,7 @@ class ExtentSchema(BaseModel):
     """An extent of the surface along a direction."""
 
     along: str = Field(description="as it was asked for: R, A, S, longest, or three numbers")
-    direction: list[float] = Field(description="unit vector (RAS)")
+    direction: list[float] = Field(description="unit vector in the input's world")
     extent_mm: EstimateSchema
 
 
@@ -67,7 +73,7 @@ class FitSchema(BaseModel):
 
 
 class PoseSchema(BaseModel):
-    """Where the shape lies in the world: canonical = scale * rotation * flip * (world - position)."""
+    """Where the shape lies in the input's world: canonical = scale * rotation * flip * (world - position)."""
 
     position_mm: list[float] = Field(description="the model's origin in the world")
     rotation: list[list[float]] = Field(description="3 x 3, by rows")
@@ -117,10 +123,10 @@ class Links(BaseModel):
 
 
 class Summary(BaseModel):
-    """What a reconstruction found; coordinates are RAS in mm."""
+    """What a reconstruction found; coordinates are of the input's world in mm."""
 
     model: ModelReference
-    space: Literal["RAS"] = "RAS"
+    space: InputSpace
     unit: Literal["mm"] = "mm"
     fit: FitSchema
     pose: PoseSchema
@@ -152,7 +158,7 @@ class ResultSummary(Summary):
 class SurfaceSd(BaseModel):
     """Standard deviation of the surface at each vertex, in the order of the mesh in PLY."""
 
-    space: Literal["RAS"] = "RAS"
+    space: InputSpace
     unit: Literal["mm"] = "mm"
     surface_sd_mm: list[float]
 
@@ -167,7 +173,7 @@ class GainSchema(BaseModel):
 class NextPlaneSchema(BaseModel):
     """Where to draw next."""
 
-    space: Literal["RAS"] = "RAS"
+    space: InputSpace
     unit: Literal["mm"] = "mm"
     plane: PlaneSchema | None = Field(description="plane of voxels of the first mask; null for a free one")
     origin_mm: list[float] = Field(description="a point of the plane, the middle of the expected section")

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter, TooLarge, UnknownModel
-from model.geometry import Grid, Pose
+from model.geometry import Grid, Pose, Space
 from model.inference.comparison import compared
 from model.inference.fitting import Fit, FitStatus
 from model.inference.latent import LatentFeatures, latent_features, shape_between
@@ -110,7 +110,7 @@ def annotated_planes(stacks: tuple[MaskStack, ...], rule: AnnotatedRule | Sequen
 
 
 def compare(outcome: Outcome, other: Outcome) -> Mesh:
-    """Surface of an outcome with its signed distance (mm) to another's, both in the world of their inputs."""
+    """Surface of an outcome with its signed distance (mm) to another's, both in the world of their inputs (RAS)."""
     return compared(outcome.reconstruction.mesh, other.reconstruction.mesh)
 
 
@@ -234,15 +234,17 @@ class Way:
 
     Attributes:
         spacing_mm: grid step of the surfaces; the model's when None.
+        space: in which the coordinates of that world are to be told.
     """
 
     model: ShapeModel
     start: Fit
     end: Fit
     spacing_mm: float | None
+    space: Space
 
     def shape(self, at: float) -> Mesh:
-        """Surface at a place, 0 the start and 1 the end."""
+        """Surface at a place, 0 the start and 1 the end; world RAS mm."""
         return shape_between(self.model, self.start.latent, self.end.latent, self.start.pose, at, self.spacing_mm)
 
 
@@ -261,7 +263,7 @@ def way_between(
     model = _same_model(catalogue, outcome)
     start, end = outcome.reconstruction.state.fits[0], other.reconstruction.state.fits[0]
     require_step(model, spacing_mm, max_voxels, log_scale=start.pose.log_scale)
-    return Way(model, start, end, spacing_mm)
+    return Way(model, start, end, spacing_mm, outcome.reconstruction.space)
 
 
 def describe(catalogue: Catalogue) -> Iterator[ShapeModel]:

@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
 from model.errors import InvalidParameter
+from model.geometry import Space, ras_to
 from model.inference.estimates import Estimate, estimate_of
 from model.inference.mesh import Mesh
 from model.inference.spread import SurfaceSpread
@@ -63,8 +64,12 @@ def parse_extents(text: str) -> tuple[str, ...]:
     return tuple(words)
 
 
-def direction_of(along: str) -> Float[np.ndarray, "3"] | None:
+def direction_of(along: str, space: Space = "RAS") -> Float[np.ndarray, "3"] | None:
     """Unit direction (RAS) of a word, None for the longest diameter.
+
+    Args:
+        along: ``R``, ``A`` and ``S`` mean the same in every world, three numbers are of the one that is named.
+        space: world of the numbers.
 
     Raises:
         InvalidParameter: neither a name nor three numbers, not all of them zero.
@@ -78,7 +83,7 @@ def direction_of(along: str) -> Float[np.ndarray, "3"] | None:
         with np.errstate(over="ignore"):
             length = float(np.linalg.norm(vector))
         if 0.0 < length < np.inf:
-            return vector / length
+            return np.asarray(ras_to(space) @ vector / length)
     raise InvalidParameter(
         f"extents must hold R, A, S, {LONGEST} or three numbers with blanks between them that are not all zero, "
         "such as 0.5 0 0.87.",
@@ -86,13 +91,19 @@ def direction_of(along: str) -> Float[np.ndarray, "3"] | None:
     )
 
 
-def measure_extents(mesh: Mesh, spread: SurfaceSpread | None, extents: Sequence[str]) -> tuple[Extent, ...]:
-    """Extents of a surface in the order in which they were asked for, with 90 % intervals."""
-    return tuple(_measure(mesh, spread, along) for along in extents)
+def measure_extents(
+    mesh: Mesh, spread: SurfaceSpread | None, extents: Sequence[str], space: Space = "RAS"
+) -> tuple[Extent, ...]:
+    """Extents of a surface in the order in which they were asked for, with 90 % intervals.
+
+    Args:
+        mesh: world RAS mm.
+        space: world of the directions that are given as numbers.
+    """
+    return tuple(_measure(mesh, spread, along, direction_of(along, space)) for along in extents)
 
 
-def _measure(mesh: Mesh, spread: SurfaceSpread | None, along: str) -> Extent:
-    direction = direction_of(along)
+def _measure(mesh: Mesh, spread: SurfaceSpread | None, along: str, direction: Float[np.ndarray, "3"] | None) -> Extent:
     low, high = _farthest(mesh) if direction is None else _ends(mesh, direction)
     if direction is None:
         direction = mesh.vertices[high] - mesh.vertices[low]

@@ -1,11 +1,12 @@
 """One segmentation volume, its planes of voxels and the boxes around its foreground."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from model.geometry import Grid
+from model.geometry import Grid, Space
 
 
 @dataclass(frozen=True)
@@ -17,12 +18,19 @@ class MaskStack:
         grid: its voxels in the world (RAS mm).
         foreground: (i, j, k) voxels of the object.
         excluded: (i, j, k) voxels that were never looked at (value 255), whatever the planes say.
+        space: world in which answers about this volume are told; its grid is RAS all the same.
     """
 
     part: str
     grid: Grid
     foreground: Bool[np.ndarray, "i j k"]
     excluded: Bool[np.ndarray, "i j k"]
+    space: Space = "RAS"
+
+
+def common_space(stacks: Sequence[MaskStack]) -> Space:
+    """World in which answers about all of the stacks are told: LPS where every one's is, RAS otherwise."""
+    return "LPS" if stacks and all(stack.space == "LPS" for stack in stacks) else "RAS"
 
 
 @dataclass(frozen=True, order=True)

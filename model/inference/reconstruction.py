@@ -9,6 +9,7 @@ from typing import Literal
 
 from model.bundle import ShapeModel
 from model.errors import InvalidMask, InvalidParameter
+from model.geometry import Space
 from model.inference.agreement import disagreeing_planes, plane_warnings, sections_of
 from model.inference.calipers import USUAL_EXTENTS, Extent, direction_of, measure_extents
 from model.inference.coverage import coverage_warnings
@@ -16,6 +17,7 @@ from model.inference.discrepancy.conditioning import DiscrepancyPrior, corrected
 from model.inference.ensemble import fit_ensemble
 from model.inference.estimates import Estimate
 from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
+from model.inference.mask_stack import common_space
 from model.inference.mesh import Mesh
 from model.inference.objective import Place, reweighted
 from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
@@ -88,7 +90,7 @@ class PlaneResidual:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """The answer, in world RAS mm.
+    """The answer; all coordinates are world RAS mm, whatever `space` says.
 
     Attributes:
         state: evaluates the field; `occupancy` takes it.
@@ -100,6 +102,7 @@ class Reconstruction:
         log_prior_density: nats.
         typicality_percentile: percentage of real shapes that are less like the population, 0 to 100.
         warnings: plain sentences, for example that the shape is unlike the training population.
+        space: world in which the coordinates are to be told, that of the stacks.
     """
 
     state: ShapeState
@@ -113,6 +116,7 @@ class Reconstruction:
     log_prior_density: float
     typicality_percentile: float
     warnings: tuple[str, ...]
+    space: Space = "RAS"
 
 
 def farthest_mm(model: ShapeModel) -> float:
@@ -164,6 +168,7 @@ def reconstruct(
         mesh = replace(mesh, scalars={"surface_sd_mm": sd_mm})
     plain_sd = None if sd_mm is None or state.covariance is None else uncalibrated(model, sd_mm)
     trusted = observations if found.plane_weights is None else reweighted(observations, found.plane_weights)
+    space = common_space(stacks)
     sections = sections_of(observations, fitted_logits(model, found, observations.points), found.plane_weights)
     figures = figures_of(model, found, stacks, drawing, mesh, usual, plain_sd)
     thick = thickness_warnings(stacks, observations.planes, mesh)
@@ -181,7 +186,7 @@ def reconstruct(
         ),
         volume_ml=volume_estimate(mesh, spread),
         area_cm2=area_estimate(mesh, spread),
-        extents=measure_extents(mesh, spread, options.extents),
+        extents=measure_extents(mesh, spread, options.extents, space),
         log_prior_density=density,
         typicality_percentile=percentile,
         warnings=_warnings(found)
@@ -191,6 +196,7 @@ def reconstruct(
         + predictive_warnings(sections, probabilities, named)
         + coverage_warnings(trusted, mesh.vertices)
         + reliability_warnings(model.manifest.usual, figures, stacks, observations.planes, mesh),
+        space=space,
     )
 
 

@@ -77,6 +77,7 @@ def read_outcome(folder: Path, document: dict[str, Any]) -> Outcome:
         log_prior_density=answer["log_prior_density"],
         typicality_percentile=answer["typicality_percentile"],
         warnings=tuple(answer["warnings"]),
+        space=answer.get("space", "RAS"),
     )
     grid = Grid(tuple(document["grid"]["shape"]), np.array(document["grid"]["affine"]))
     model = document["model"]
@@ -110,6 +111,7 @@ def _document(outcome: Outcome) -> dict[str, Any]:
             "log_prior_density": float(answer.log_prior_density),
             "typicality_percentile": float(answer.typicality_percentile),
             "warnings": list(answer.warnings),
+            "space": answer.space,
         },
     }
 

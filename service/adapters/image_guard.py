@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from model.errors import InvalidMask, TooLarge, UnreadableImage
+from model.geometry import ras_to
 
 #: Bytes of an image: held, on disk, or an open binary file that can seek.
 Source = bytes | Path | BinaryIO
@@ -27,7 +28,7 @@ HEADER_LIMIT = 1 << 20
 #: Bytes beyond the claimed voxels that are tolerated (padding).
 TRAILING_LIMIT = 1 << 16
 #: From LPS to RAS mm, and back.
-LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+LPS_TO_RAS = np.diag([*np.diag(ras_to("LPS")), 1.0])
 #: Bytes inflated at a time.
 CHUNK = 1 << 20
 

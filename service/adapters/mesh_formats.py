@@ -9,7 +9,7 @@ import io
 import struct
 import zipfile
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, get_args
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -21,10 +21,12 @@ from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl
 
 from model.errors import InvalidParameter
+from model.geometry import Space, ras_to
 from model.inference.mesh import Mesh, to_trimesh, transformed
 
 Writer = Callable[[Mesh, Mapping[str, str]], bytes]
 
+SPACES: tuple[str, ...] = get_args(Space)
 UNITS = "mm"
 STL_HEADER_SIZE = 80
 MZ3_MAGIC = 0x5A4D
@@ -55,14 +57,13 @@ def write_mesh(mesh: Mesh, format: str, *, space: str = "RAS", metadata: Mapping
     writers = _writers()
     if format not in writers:
         raise InvalidParameter(f"The mesh format must be one of {', '.join(writers)}.", part="format")
-    if space not in ("RAS", "LPS"):
+    if space not in SPACES:
         raise InvalidParameter("The space of a mesh must be RAS or LPS.", part="space")
     if mesh.is_empty:
         raise InvalidParameter("Only a surface with at least one face can be written.", part="mesh")
-    placed = mesh if space == "RAS" else transformed(mesh, np.diag([-1.0, -1.0, 1.0, 1.0]))
     frame = {"space": space, "units": UNITS}
     said = {key: _one_line(value) for key, value in {**frame, **metadata, **frame}.items()}
-    return writers[format](placed, said)
+    return writers[format](_placed(mesh, space), said)
 
 
 def colours(values: Float[np.ndarray, "v"]) -> UInt8[np.ndarray, "v 4"]:
@@ -73,6 +74,12 @@ def colours(values: Float[np.ndarray, "v"]) -> UInt8[np.ndarray, "v 4"]:
     place = values / top if top > 0 else np.zeros(len(values))
     channels = [np.interp(place, stops, [colour[channel] for colour in ramp]) for channel in range(3)]
     return np.asarray(np.rint(np.stack([*channels, np.full(len(values), 255.0)], axis=1)), np.uint8)
+
+
+def _placed(mesh: Mesh, space: str) -> Mesh:
+    turn = np.eye(4)
+    turn[:3, :3] = ras_to("LPS")
+    return transformed(mesh, turn) if space == "LPS" else mesh
 
 
 def _writers() -> dict[str, Writer]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from model.geometry import Space
 from model.inference.mesh import area_cm2, volume_ml
 from model.inference.posterior_shapes import PosteriorShape
 from service.adapters.sample_files import SampleFile
@@ -30,7 +31,7 @@ class PosteriorWriter:
             return SampleFile("", b"", {"file": None, **_entry(shape, seed)})
         name = f"posterior-{seed}.{self._format.value}"
         said = {**_model(posterior), "seed": seed}
-        data = self._write_mesh(shape.mesh, self._format.value, space="RAS", metadata=said)
+        data = self._write_mesh(shape.mesh, self._format.value, space=_space(posterior), metadata=said)
         return SampleFile(name, data, {"file": name, **_entry(shape, seed)})
 
     def manifest(self, posterior: Posterior, identifier: str, entries: Sequence[dict[str, Any]]) -> bytes:
@@ -39,13 +40,17 @@ class PosteriorWriter:
             "model": _model(posterior),
             "reconstruction": identifier,
             "uncertainty": posterior.outcome.options.uncertainty,
-            "space": "RAS",
+            "space": _space(posterior),
             "unit": "mm",
             "format": self._format.value,
             "spacing_mm": posterior.spacing_mm or posterior.model.manifest.resolution_mm,
             "samples": list(entries),
         }
         return json.dumps(document, indent=1).encode()
+
+
+def _space(posterior: Posterior) -> Space:
+    return posterior.outcome.reconstruction.space
 
 
 def _model(posterior: Posterior) -> dict[str, object]:

@@ -63,7 +63,7 @@ def _unpack(tools: JobTools, files: JobFiles) -> Record:
         )
     files.put_note("names", {"names": names})
     model = tools.registry.names()
-    files.put_note("manifest", {"kind": RECONSTRUCTIONS_JOB, "unit": "mm", "space": "RAS", "models": list(model)})
+    files.put_note("manifest", {"kind": RECONSTRUCTIONS_JOB, "unit": "mm", "models": list(model)})
     return {"count": len(names)}
 
 
@@ -121,7 +121,8 @@ def _reconstruct_one(tools: JobTools, item: Record, check: Check) -> Record:
 
 def _put(tools: JobTools, files: JobFiles, number: int, name: str, format: str, outcome: Outcome) -> None:
     metadata = {"model": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest}
-    surface = tools.write_mesh(outcome.reconstruction.mesh, format, space="RAS", metadata=metadata)
+    answer = outcome.reconstruction
+    surface = tools.write_mesh(answer.mesh, format, space=answer.space, metadata=metadata)
     summary = json.loads(summary_of(outcome).model_dump_json())
     file = f"{number:06d}.{format}"
     files.put_item(number, {file: surface}, {"mask": name, "file": file, "summary": summary})

@@ -44,7 +44,10 @@ async def read_comparison(
     services: WithServices,
     ticket: WithTicket,
 ) -> Response:
-    """The surface of this result; the scalar `signed_distance_mm` is positive where it lies outside the other one."""
+    """The surface of this result in its input's world, or in `space`.
+
+    The scalar `signed_distance_mm` is positive where it lies outside the other one.
+    """
     return await run_while_connected(request, ticket, lambda _: _comparison(services, identifier, query))
 
 
@@ -53,5 +56,6 @@ def _comparison(services: Services, identifier: str, query: ComparisonQuery) -> 
     mesh = use_cases.compare(result.outcome, services.store.load(query.other).outcome)
     outcome, format = result.outcome, MeshFormat(query.format)
     metadata = model_metadata(outcome.model_name, outcome.model_version, outcome.model_digest)
-    data = services.write_mesh(mesh, format.value, space="RAS", metadata=metadata)
+    space = query.space or outcome.reconstruction.space
+    data = services.write_mesh(mesh, format.value, space=space, metadata=metadata)
     return Response(data, media_type=MESH_MEDIA_TYPES[format], headers=attachment(f"comparison.{format.value}"))

@@ -105,7 +105,7 @@ def _wire(outcome: Outcome, found: LatentFeatures) -> Features:
 def _bytes(services: Services, way: use_cases.Way, query: InterpolationQuery, at: float) -> bytes:
     manifest = way.model.manifest
     said = model_metadata(manifest.name, manifest.version, way.model.digest)
-    return services.write_mesh(way.shape(at), query.format.value, space="RAS", metadata={**said, "at": f"{at:g}"})
+    return services.write_mesh(way.shape(at), query.format.value, space=way.space, metadata={**said, "at": f"{at:g}"})
 
 
 async def _zip_chunks(
@@ -123,6 +123,6 @@ async def _zip_chunks(
             for chunk in archive.all_files():
                 yield chunk
     entries = [{"file": name, "at": place} for name, place in zip(names, places, strict=True)]
-    archive.add(json.dumps({"space": "RAS", "unit": "mm", "shapes": entries}, indent=1).encode(), MANIFEST)
+    archive.add(json.dumps({"space": way.space, "unit": "mm", "shapes": entries}, indent=1).encode(), MANIFEST)
     for chunk in archive.finalize():
         yield chunk

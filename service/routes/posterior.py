@@ -34,7 +34,7 @@ def posterior_router() -> APIRouter:
         response_class=Response,
         summary="Shapes that the result could also be",
         responses={
-            200: files([ZIP], f"one mesh a shape, RAS mm; {MANIFEST} comes last"),
+            200: files([ZIP], f"one mesh a shape, in the input's world, mm; {MANIFEST} comes last"),
             **problems(404, 413, 422, 503),
         },
     )

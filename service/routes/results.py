@@ -49,7 +49,7 @@ def results_router() -> APIRouter:
         methods=["GET"],
         response_class=Response,
         summary="Surface of a result",
-        responses={200: files(MESH_MEDIA_TYPES.values(), "the surface, RAS mm"), **problems(404, 422)},
+        responses={200: files(MESH_MEDIA_TYPES.values(), "the surface in the input's world, mm"), **problems(404, 422)},
     )
     nifti = files([NIFTI], "a gzipped NIfTI file (.nii.gz)")
     _add_volume(router, "/segmentation", read_segmentation, "Dense label map", {200: nifti})
@@ -84,8 +84,8 @@ def delete_result(identifier: Identifier, services: WithServices) -> Response:
 
 
 def read_mesh(identifier: Identifier, query: Annotated[MeshQuery, Query()], services: WithServices) -> Response:
-    """The watertight surface in the input's world, RAS mm."""
-    data = mesh_bytes(services, services.store.load(identifier), query.format, query.max_error_mm)
+    """The watertight surface in the input's world or in `space`, mm; the file says which where its format can."""
+    data = mesh_bytes(services, services.store.load(identifier), query.format, query.max_error_mm, query.space)
     headers = attachment(f"reconstruction.{query.format.value}")
     return Response(data, media_type=MESH_MEDIA_TYPES[query.format], headers=headers)
 
@@ -132,8 +132,10 @@ async def read_uncertainty(
 
 
 def _surface_sd(services: Services, identifier: str) -> Response:
-    values = use_cases.surface_sd(services.store.load(identifier).outcome)
-    return JSONResponse(SurfaceSd(surface_sd_mm=values.tolist()).model_dump(mode="json"))
+    outcome = services.store.load(identifier).outcome
+    values = use_cases.surface_sd(outcome)
+    told = SurfaceSd(space=outcome.reconstruction.space, surface_sd_mm=values.tolist())
+    return JSONResponse(told.model_dump(mode="json"))
 
 
 def _nifti(

@@ -6,8 +6,9 @@ import zipfile
 
 import pytest
 
+from tests.dicom_parts import file_bytes, mr_series, seg_of
 from tests.job_parts import ended, working
-from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, running
+from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, running, sparse_ellipsoid
 
 JOBS = "/v1/jobs"
 
@@ -31,7 +32,7 @@ def archive_of(**masks: bytes) -> bytes:
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w") as archive:
         for name, data in masks.items():
-            archive.writestr(f"masks/{name}.nii", data)
+            archive.writestr(f"masks/{name}" if "." in name else f"masks/{name}.nii", data)
         archive.writestr("masks/read.me", "no mask")
     return target.getvalue()
 
@@ -55,14 +56,21 @@ def test_bulk_samples_are_those_of_single_requests(client):
 
 
 def test_each_mask_of_an_archive_is_reconstructed_and_one_at_fault_stops_no_other(client):
-    archive = archive_of(a=mask_bytes(), b=b"no image", c=mask_bytes((12.0, 9.0, 8.0)))
-    parts = {**form(kind="reconstructions", uncertainty="none"), "archive": ("masks.zip", archive)}
+    drawing = file_bytes(seg_of(mr_series(), sparse_ellipsoid()[0]))
+    archive = archive_of(a=mask_bytes(), b=b"no image", c=mask_bytes((12.0, 9.0, 8.0)), **{"d.dcm": drawing})
+    parts = {**form(kind="reconstructions", uncertainty="none", format="ply"), "archive": ("masks.zip", archive)}
     summary = ended(client, client.post(JOBS, files=parts).headers["location"])
-    assert (summary["state"], summary["done"]) == ("done", 3)
+    assert (summary["state"], summary["done"]) == ("done", 4)
     files = members(client.get(summary["links"]["result"]))
-    first, second, third = json.loads(files["manifest.json"])["reconstructions"]
-    assert [entry["mask"] for entry in (first, second, third)] == [f"masks/{name}.nii" for name in "abc"]
+    first, second, third, fourth = json.loads(files["manifest.json"])["reconstructions"]
+    assert [entry["mask"] for entry in (first, second, third, fourth)] == [
+        *(f"masks/{name}.nii" for name in "abc"),
+        "masks/d.dcm",
+    ]
     assert "problem" in second
+    assert (first["summary"]["space"], fourth["summary"]["space"]) == ("RAS", "LPS")
+    assert b"comment space LPS" in files[fourth["file"]]
+    assert "space" not in json.loads(files["manifest.json"])
     assert files[first["file"]] != files[third["file"]]
     assert first["summary"]["fit"]["converged"]
 

@@ -1,5 +1,6 @@
 """Drawn objects of DICOM, by their class: segmentations and structure sets."""
 
+from dataclasses import replace
 from typing import BinaryIO
 
 from pydicom import Dataset
@@ -31,7 +32,7 @@ def stacks_of_object(
     labels: frozenset[int] | None = None,
     home: Grid | None = None,
 ) -> tuple[MaskStack, ...]:
-    """One mask stack for each direction of planes that the object draws on, world RAS mm.
+    """One mask stack for each direction of planes that the object draws on; their grids are RAS, answers are LPS.
 
     Args:
         labels: numbers of segments or regions; all when None.
@@ -44,13 +45,15 @@ def stacks_of_object(
     with tolerant(part):
         kind = found.get("SOPClassUID")
     if kind in SEGMENTATIONS:
-        return read_segmentation(found, part, limits, labels, home)
-    if kind == RTStructureSetStorage:
-        return read_structure_set(found, part, limits, labels, home)
-    raise UnreadableImage(
-        f"{part} is a DICOM object of another kind; segmentations (SEG) and structure sets (RTSTRUCT) are accepted",
-        part=part,
-    )
+        stacks = read_segmentation(found, part, limits, labels, home)
+    elif kind == RTStructureSetStorage:
+        stacks = read_structure_set(found, part, limits, labels, home)
+    else:
+        raise UnreadableImage(
+            f"{part} is a DICOM object of another kind; segmentations (SEG) and structure sets (RTSTRUCT) are accepted",
+            part=part,
+        )
+    return tuple(replace(stack, space="LPS") for stack in stacks)
 
 
 def referenced_series(found: Dataset) -> UID:

@@ -17,6 +17,7 @@ from service.model_registry import BrokenModel, ModelRegistry
 from service.ports import MeshFormat
 from service.settings import Settings
 from tests.analytic_model import ellipsoid_model
+from tests.dicom_parts import file_bytes, mr_series, seg_of
 from tests.service_parts import NAME, mask_bytes, sparse_ellipsoid
 
 
@@ -63,6 +64,17 @@ def test_a_reconstruction_writes_all_that_is_asked_for(mask, tmp_path, capsys):
         image = nib.Nifti1Image.from_bytes(gzip.decompress(file.read_bytes()))
         assert image.shape == grid.shape
         np.testing.assert_allclose(image.affine, grid.affine, atol=1e-5)
+
+
+def test_a_drawing_in_dicom_is_answered_in_its_own_world(tmp_path, capsys):
+    drawing, target = tmp_path / "drawing.dcm", tmp_path / "surface.ply"
+    drawing.write_bytes(file_bytes(seg_of(mr_series(), sparse_ellipsoid()[0])))
+    assert run("reconstruct", drawing, "--output", target, "--uncertainty", "none", "--json") == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["space"] == "LPS"
+    assert b"comment space LPS" in target.read_bytes()
+    middle = trimesh.load(target).vertices.mean(axis=0)
+    np.testing.assert_allclose(middle, summary["pose"]["position_mm"], atol=2.0)
 
 
 def test_a_person_gets_sentences(mask, capsys):

@@ -94,3 +94,12 @@ def test_too_many_are_refused():
 def test_directions_are_units(vector):
     direction = direction_of(" ".join(map(repr, vector)))
     assert np.linalg.norm(direction) == pytest.approx(1.0)
+
+
+def test_numbers_are_of_the_named_world_and_letters_of_the_body():
+    np.testing.assert_allclose(direction_of("3 -4 0", "LPS"), [-0.6, 0.8, 0.0])
+    for letter in "RAS":
+        np.testing.assert_array_equal(direction_of(letter, "LPS"), direction_of(letter))
+    (here,), (there,) = (measure_extents(MESH, None, ["1 2 3"], "RAS"), measure_extents(MESH, None, ["-1 -2 3"], "LPS"))
+    assert there.extent_mm == here.extent_mm
+    assert there.direction == here.direction

@@ -64,6 +64,18 @@ def test_what_is_kept_comes_back_exactly(store, uncertain):
     assert_same(kept.outcome, outcome)
 
 
+def test_a_result_keeps_the_world_that_it_is_told_in(store, tmp_path):
+    outcome = outcome_of()
+    told = dataclasses.replace(outcome, reconstruction=dataclasses.replace(outcome.reconstruction, space="LPS"))
+    kept = store.save(told)
+    assert_same(store.load(kept.id).outcome, told)
+    (summary,) = (tmp_path / "r").rglob(SUMMARY)
+    document = json.loads(summary.read_text())
+    del document["reconstruction"]["space"]  # as results of earlier versions are
+    summary.write_text(json.dumps(document))
+    assert store.load(kept.id).outcome.reconstruction.space == "RAS"
+
+
 @pytest.mark.parametrize("uncertainty", ["laplace", "ensemble"])
 def test_a_field_that_was_completed_and_follows_its_contours_comes_back_exactly(store, uncertainty):
     model = completing(ellipsoid_model(), BallCompleter(9.0), 0.5)

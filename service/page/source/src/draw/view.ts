@@ -148,7 +148,7 @@ export class DrawView {
   }
 
   private async showSurface(summary: Summary, signal: AbortSignal): Promise<void> {
-    const surface = readMz3(await this.api.bytes(resultPath(summary.id, '/mesh?format=mz3'), signal))
+    const surface = readMz3(await this.api.bytes(resultPath(summary.id, '/mesh?format=mz3&space=RAS'), signal))
     const scale = surface.scalars && scaleFromZero(surface.scalars)
     const look = this.look.begin(scale && { name: T.figures.sdShort, label: T.figures.sdLegend, unit: 'mm', scale }, false)
     await this.surface.show(surface, look)

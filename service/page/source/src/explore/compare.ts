@@ -68,7 +68,7 @@ export class Compare {
   }
 
   private async fetch(id: string, other: string): Promise<Surface> {
-    return readMz3(await this.api.bytes(resultPath(id, `/comparison?other=${encodeURIComponent(other)}&format=mz3`)))
+    return readMz3(await this.api.bytes(resultPath(id, `/comparison?other=${encodeURIComponent(other)}&format=mz3&space=RAS`)))
   }
 }
 

@@ -30,7 +30,7 @@ export class ResultPanel {
 
   /** The surface first; slices follow once it is on the screen. */
   async show(summary: Summary, drawn: DrawnPlanes | null, signal: AbortSignal): Promise<void> {
-    const surface = readMz3(await this.api.bytes(resultPath(summary.id, '/mesh?format=mz3'), signal))
+    const surface = readMz3(await this.api.bytes(resultPath(summary.id, '/mesh?format=mz3&space=RAS'), signal))
     const colouring: Colouring | null = surface.scalars && {
       name: T.figures.sdShort,
       label: T.figures.sdLegend,

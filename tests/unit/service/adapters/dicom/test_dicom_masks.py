@@ -2,12 +2,14 @@
 
 import io
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from pydicom.uid import DeflatedExplicitVRLittleEndian, RLELossless
 
 from model.errors import InputError, InvalidGeometry, InvalidMask, TooLarge, UnreadableImage
+from model.inference.mask_stack import common_space
 from model.inference.observations import Plane, find_planes
 from service.adapters.dicom.masks import read_dicom_mask, stacks_of_object
 from service.adapters.dicom.series import series_of
@@ -59,6 +61,19 @@ def test_segmentation_lies_where_it_was_drawn(images, kind):
     drawn = [p.index for p in find_planes((stack,), "auto")]
     assert len(drawn) == len(np.flatnonzero(values.any(axis=(0, 1))))
     assert not stack.excluded[:, :, drawn].any()
+
+
+def test_answers_about_dicom_are_told_in_its_own_world():
+    images = mr_series()
+    drawn = [("CLOSED_PLANAR", ring(images, 9, (6.0,))[0]), ("CLOSED_PLANAR", ring(images, 10, (6.0,))[0])]
+    segmentation, structures = (
+        stacks_of_object(reread(found), "object", LIMITS)
+        for found in (seg_of(images, drawing(images)[0].astype(np.uint8)), rtstruct_of(images, drawn))
+    )
+    plain = (replace(segmentation[0], space="RAS"),)
+    for stacks, space in ((segmentation, "LPS"), (structures, "LPS"), (plain, "RAS"), (segmentation + plain, "RAS")):
+        assert common_space(stacks) == space
+    assert common_space(()) == "RAS"
 
 
 def test_planes_without_a_frame_were_not_looked_at(images):
