@@ -26,7 +26,7 @@ from service.routes.comparisons import comparisons_router
 from service.routes.dependencies import Services
 from service.routes.jobs import jobs_router
 from service.routes.latent import latent_router
-from service.routes.middleware import AccessMiddleware, BodyLimitMiddleware, KeyMiddleware
+from service.routes.middleware import AccessMiddleware, BodyLimitMiddleware, HeadMiddleware, KeyMiddleware
 from service.routes.models import models_router
 from service.routes.modes import modes_router
 from service.routes.operations import operations_router
@@ -98,6 +98,7 @@ def create_app(
     app.state.pacs = pacs
     _add_routes(app)
     install_handlers(app, settings.retry_after_s)
+    app.add_middleware(HeadMiddleware)
     app.add_middleware(BodyLimitMiddleware, max_bytes=settings.max_body_bytes)
     app.add_middleware(KeyMiddleware, keys=settings.keys)
     app.add_middleware(AccessMiddleware, log=services.log, metrics=services.metrics)

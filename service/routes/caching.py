@@ -10,7 +10,7 @@ from starlette.responses import Response
 
 from model.bundle import ShapeModel
 from service.routes.dependencies import Services
-from service.routes.negotiation import matches_etag
+from service.routes.negotiation import listed, matches_etag
 from service.routes.responses import Responses
 
 #: What depends on the model's digest and the query alone may be kept for ever.
@@ -29,7 +29,7 @@ def caching_headers(services: Services, model: ShapeModel, kind: str, *query: ob
 
 def is_held(request: Request, headers: Mapping[str, str]) -> bool:
     """Whether the client holds the answer of these headers already."""
-    return matches_etag(request.headers.get("if-none-match"), headers["ETag"])
+    return matches_etag(listed(request.headers, "if-none-match"), headers["ETag"])
 
 
 def not_modified(headers: Mapping[str, str]) -> Response:

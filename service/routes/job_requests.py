@@ -12,17 +12,18 @@ from service.job_presentation import job_summary
 from service.job_submission import JobDesk
 from service.model_registry import pinned_name
 from service.routes.dependencies import Services, address
+from service.routes.negotiation import listed
 
 JOBS_PATH = "/v1/jobs"
 
-IdempotencyKey = Annotated[
+_KEY: dict[str, Any] = {"alias": "Idempotency-Key", "min_length": 1, "max_length": 255}
+_SAME = "the same key with the same request leads to the same job, however often it is sent"
+
+IdempotencyKey = Annotated[str | None, Header(**_KEY, description=_SAME)]
+#: Of a request that is a job only when it asks for one.
+KeyOfJob = Annotated[
     str | None,
-    Header(
-        alias="Idempotency-Key",
-        min_length=1,
-        max_length=255,
-        description="the same key with the same request leads to the same job, however often it is sent",
-    ),
+    Header(**_KEY, description=f"with `Prefer: respond-async` {_SAME}; without it every request is computed anew"),
 ]
 Prefer = Annotated[str | None, Header(alias="Prefer", description="`respond-async` answers a job at once (RFC 7240)")]
 
@@ -30,13 +31,22 @@ Prefer = Annotated[str | None, Header(alias="Prefer", description="`respond-asyn
 JOB_ACCEPTED: dict[str, Any] = {
     "description": "the request has become a job",
     "content": {"application/json": {"schema": {"$ref": "#/components/schemas/JobSummary"}}},
-    "headers": {"Location": {"schema": {"type": "string"}, "description": "address of the job"}},
+    "headers": {
+        "Location": {"schema": {"type": "string"}, "description": "address of the job"},
+        "Preference-Applied": {"schema": {"type": "string"}, "description": "`respond-async` when Prefer asked for it"},
+    },
 }
 
 
-def prefers_async(prefer: str | None) -> bool:
-    """Whether the header Prefer asks for an answer at once."""
-    return any(item.strip().split(";")[0].lower() == "respond-async" for item in (prefer or "").split(","))
+def prefers_async(request: Request) -> bool:
+    """Whether the header Prefer, on any of its lines, asks for an answer at once."""
+    wishes = (listed(request.headers, "prefer") or "").split(",")
+    return any(wish.split(";")[0].strip().lower() == "respond-async" for wish in wishes)
+
+
+def wants_job(request: Request, _: Prefer = None) -> bool:
+    """`prefers_async` as what a route depends on, which puts the header into the interface's description."""
+    return prefers_async(request)
 
 
 def submittable_model(services: Services, name: str | None) -> str:
@@ -56,7 +66,8 @@ def submit(
 
 
 def accepted_job(request: Request, status: JobStatus) -> Response:
-    """The answer 202 with the job's address."""
+    """The answer 202 with the job's address; says that a preference was met when there was one (RFC 7240, 3)."""
     place = address(request, f"{JOBS_PATH}/{status.id}")
-    headers = {"Location": place, "Preference-Applied": "respond-async"}
+    applied = {"Preference-Applied": "respond-async"} if prefers_async(request) else {}
+    headers = {"Location": place, **applied}
     return JSONResponse(job_summary(status, address(request, "")).model_dump(mode="json"), 202, headers=headers)

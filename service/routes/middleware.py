@@ -138,6 +138,37 @@ class _Body:
         await self._send(message)
 
 
+class HeadMiddleware:
+    """Innermost: answers HEAD with the headers of GET and no body (RFC 9110, 9.1 and 9.3.2)."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one request on; work for a body ends where the body would begin."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+        asked = {**scope, "method": "GET"}
+
+        async def head(message: Message) -> None:
+            if message["type"] == "http.response.body":
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
+                raise _HeadSent
+            await send(message)
+
+        try:
+            await self._app(asked, receive, head)
+        except _HeadSent:
+            pass
+        finally:
+            scope["route"] = asked.get("route")
+
+
+class _HeadSent(Exception):
+    """The whole answer to HEAD is sent."""
+
+
 async def _refuse(error: MorphoFlowError, scope: Scope, receive: Receive, send: Send) -> None:
     response = respond_to(error, request_id=scope["state"]["request_id"], retry_after_s=0)
     response.headers["Connection"] = "close"

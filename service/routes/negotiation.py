@@ -1,8 +1,16 @@
-"""Content negotiation (RFC 9110, sections 12.5.1 and 13.1.2)."""
+"""Content negotiation (RFC 9110, sections 5.3, 12.5.1 and 13.1.2)."""
 
 from collections.abc import Sequence
 
+from starlette.datastructures import Headers
+
 from service.errors import NotAcceptable
+
+
+def listed(headers: Headers, name: str) -> str | None:
+    """Value of a header that holds a list, its lines joined as if they were one; None when it is not there."""
+    lines = headers.getlist(name)
+    return ", ".join(lines) if lines else None
 
 
 def negotiate(accept: str | None, offered: Sequence[str]) -> str:

@@ -7,12 +7,15 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
+from starlette.routing import Match, Mount
 
 from model.errors import InputError, InvalidParameter, MorphoFlowError
 from service.errors import PROTOCOL_KINDS, HelperLost, Kind, Overloaded, Unauthorised, kind_of
 from service.schemas import Problem
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
+#: Methods that a route may take; HEAD goes with GET.
+METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 #: Sentences for what the HTTP layer finds by itself; its own may repeat what the client sent.
 PROTOCOL_SENTENCES = {
     400: "The request's body cannot be parsed; send multipart/form-data with a boundary.",
@@ -74,8 +77,20 @@ def _protocol(request: Request, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
         raise error
     kind = PROTOCOL_KINDS.get(error.status_code, PROTOCOL_KINDS[400])
-    headers = dict(error.headers) if error.headers else None
+    headers = dict(error.headers) if error.headers else {}
+    if kind.status == 405:
+        headers["Allow"] = ", ".join(allowed_methods(request))
     return problem_response(kind, PROTOCOL_SENTENCES[kind.status], request_id=request_id_of(request), headers=headers)
+
+
+def allowed_methods(request: Request) -> list[str]:
+    """Methods of all routes at the path of a request; whatever answers GET answers HEAD."""
+    routes = [
+        route for route in request.app.routes if not isinstance(route, Mount)
+    ]  # a folder of files takes GET alone
+    asked = [{**request.scope, "method": method} for method in METHODS]
+    found = {one["method"] for one in asked if any(route.matches(one)[0] is Match.FULL for route in routes)} or {"GET"}
+    return sorted(found | {"HEAD"} if "GET" in found else found)
 
 
 async def _invalid(request: Request, error: Exception) -> Response:

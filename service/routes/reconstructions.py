@@ -20,16 +20,15 @@ from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithServices, address
 from service.routes.job_requests import (
     JOB_ACCEPTED,
-    IdempotencyKey,
-    Prefer,
+    KeyOfJob,
     accepted_job,
-    prefers_async,
     submit,
     submittable_model,
+    wants_job,
 )
 from service.routes.meshes import mesh_bytes
 from service.routes.multipart import require_multipart
-from service.routes.negotiation import negotiate
+from service.routes.negotiation import listed, negotiate
 from service.routes.responses import DIRECT_FORMATS, JSON, MESH_MEDIA_TYPES, attachment, files, problems
 from service.schemas import ResultSummary
 
@@ -39,7 +38,7 @@ _OFFERED = {JSON: None, **{MESH_MEDIA_TYPES[format]: format for format in DIRECT
 
 def accepted_format(request: Request) -> MeshFormat | None:
     """Mesh format that the client wants as the answer, None for the summary; `NotAcceptable` otherwise."""
-    return _OFFERED[negotiate(request.headers.get("accept"), tuple(_OFFERED))]
+    return _OFFERED[negotiate(listed(request.headers, "accept"), tuple(_OFFERED))]
 
 
 def reconstructions_router() -> APIRouter:
@@ -73,9 +72,9 @@ async def create_reconstruction(
     request: Request,
     form: Annotated[ReconstructionForm, Form(media_type="multipart/form-data")],
     wanted: Annotated[MeshFormat | None, Depends(accepted_format)],
+    as_job: Annotated[bool, Depends(wants_job)],
     services: WithServices,
-    prefer: Prefer = None,
-    key: IdempotencyKey = None,
+    key: KeyOfJob = None,
 ) -> Response:
     """Fits the model to the annotated planes of the masks.
 
@@ -84,7 +83,7 @@ async def create_reconstruction(
     """
     if len(form.mask) > services.settings.max_masks:
         raise TooLarge(f"At most {services.settings.max_masks} parts named mask are accepted.", part="mask")
-    if prefers_async(prefer):
+    if as_job:
         return await run_in_threadpool(_enqueue, request, services, form, key)
     with services.engine.admit() as ticket:
         result = await run_while_connected(request, ticket, lambda watch: _reconstruct(services, form, watch))

@@ -1,0 +1,77 @@
+"""Headers: repeated lines, methods that are allowed, answers without a body, and copies that a client holds."""
+
+import pytest
+
+from tests.service_parts import NAME, app_for, mask_parts, problem, running
+
+RECONSTRUCTIONS = "/v1/reconstructions"
+SAMPLE = f"/v1/models/{NAME}/samples/1"
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    with running(app_for(tmp_path_factory.mktemp("headers"))) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def links(client):
+    return client.post(RECONSTRUCTIONS, files=mask_parts(), data={"uncertainty": "none"}).json()["links"]
+
+
+def test_lines_of_a_header_count_together(client):
+    wanted = [("Accept", "application/xml"), ("Accept", "model/stl")]
+    made = client.post(RECONSTRUCTIONS, files=mask_parts(), data={"uncertainty": "none"}, headers=wanted)
+    assert (made.status_code, made.headers["content-type"]) == (200, "model/stl")
+    held = client.get(SAMPLE).headers["etag"]
+    assert client.get(SAMPLE, headers=[("If-None-Match", '"other"'), ("If-None-Match", held)]).status_code == 304
+    wishes = [("Prefer", "wait=1"), ("Prefer", "respond-async")]
+    assert client.post(RECONSTRUCTIONS, files=mask_parts(), headers=wishes).status_code == 202
+
+
+def test_a_preference_is_applied_where_there_was_one(client):
+    form = {"kind": (None, "samples"), "count": (None, "1")}
+    assert "preference-applied" not in client.post("/v1/jobs", files=form).headers
+    asked = client.post("/v1/jobs", files=form, headers={"Prefer": "respond-async"})
+    assert asked.headers["preference-applied"] == "respond-async"
+
+
+def test_all_methods_of_a_path_are_allowed(client, links):
+    for path, allowed in (
+        (links["self"], "DELETE, GET, HEAD"),
+        (links["mesh"], "GET, HEAD"),
+        (RECONSTRUCTIONS, "POST"),
+        ("/v1/models", "GET, HEAD"),
+        ("/v1/jobs/x", "DELETE, GET, HEAD"),
+        ("/docs", "GET, HEAD"),
+    ):
+        refused = client.patch(path)
+        assert problem(refused, 405)["type"].endswith("method-not-allowed")
+        assert refused.headers["allow"] == allowed
+    assert client.head(RECONSTRUCTIONS).headers["allow"] == "POST"
+
+
+@pytest.mark.parametrize(
+    "path", ["/healthz", "/", "/docs", "/openapi.json", "/metrics", "/v1/models", SAMPLE, f"/v1/models/{NAME}/modes"]
+)
+def test_head_has_the_headers_of_get_and_no_body(client, path):
+    whole, head = client.get(path), client.head(path)
+    assert (head.status_code, head.content) == (whole.status_code, b"")
+    own = {"x-request-id", "date", *(["content-length"] if path == "/metrics" else [])}
+    assert {name: head.headers[name] for name in set(head.headers) - own} == {
+        name: whole.headers[name] for name in set(whole.headers) - own
+    }
+    assert client.head(path, headers={"If-None-Match": head.headers.get("etag", "-")}).status_code in (200, 304)
+
+
+def test_head_of_results_problems_and_streams(client, links):
+    assert client.head(links["mesh"]).headers["content-length"] == str(len(client.get(links["mesh"]).content))
+    assert client.head(f"{RECONSTRUCTIONS}/x").status_code == 404
+    batch = f"/v1/models/{NAME}/samples"
+    assert client.head(batch, params={"count": 200}).headers["content-type"] == "application/zip"
+    assert client.head(batch, params={"count": 10**6}).status_code == 413
+    figures = client.get("/metrics").text
+    counted = 'morphoflow_requests_total{method="HEAD",route="/v1/models/{model}/samples",status="200"} 1.0'
+    assert counted in figures
+    assert 'status="500"' not in figures
+    assert client.get("/readyz").status_code == 200
