@@ -20,7 +20,7 @@ from model.inference.mesh import vertex_areas, volume_ml
 from model.inference.observations import observe
 from model.inference.posterior import fitted_logits
 from model.inference.reconstruction import COVER_SHARE_OF_BAND, OBSERVATION_BUDGET, Options, reconstruct
-from model.inference.reliability import USUAL_PLANES, Figures, figures_of
+from model.inference.reliability import MOST_USUAL_PLANES, USUAL_PLANES, Figures, figures_of
 from model.inference.uncertainty import surface_spread
 from training.cohorts.cohort import Case
 from training.perturb import Sections, parallel, sections_of
@@ -30,7 +30,7 @@ from training.surface_error import digitisation_mm, distances_to, true_points
 #: Share of sound drawings that stay below the highest usual value of one figure.
 USUAL_QUANTILE = 0.95
 #: Numbers of parallel planes.
-PARALLEL = (3, 5, 8)
+PARALLEL = (3, 5, MOST_USUAL_PLANES)
 #: SDs (of logarithms, and of nats) are not taken for smaller than these, whatever a few shapes show.
 LEAST_SD = {"misfit": 0.15, "density": 1.0, "slice": 0.2}
 

@@ -34,8 +34,8 @@ from model.inference.thick_slices import thickness_mm
 OPEN_SHARE = 0.05
 #: Slices thicker than this share of the object's size (cube root of its volume) hide some of its shape.
 THICK_SHARE = 0.15
-#: Number of planes that the figures in `Manifest.usual` are for.
-USUAL_PLANES = 5
+#: Number of planes that the figures in `Manifest.usual` are for, and the most that they were measured with.
+USUAL_PLANES, MOST_USUAL_PLANES = 5, 8
 #: Vertices at which the SD is taken, about.
 JUDGED_VERTICES = 400
 #: Share of the likelihood precision that is left to a rough drawing.
@@ -161,10 +161,14 @@ def _mean_sd(model: ShapeModel, found: Fit, points: Float[np.ndarray, "v 3"]) ->
 
 
 def highest_usual(usual: Mapping[str, float], name: str, planes: int) -> float:
-    """Highest usual value of a figure (mm) with so many planes; infinite for a model that does not say."""
+    """Highest usual value of a figure (mm) with so many planes; infinite for a model that does not say.
+
+    More planes than were measured with leave it as it is with the most.
+    """
     if f"{name}_mm" not in usual:
         return float("inf")
-    return float(usual[f"{name}_mm"] * (planes / USUAL_PLANES) ** usual[f"{name}_exponent"])
+    share = min(planes, MOST_USUAL_PLANES) / USUAL_PLANES
+    return float(usual[f"{name}_mm"] * share ** usual[f"{name}_exponent"])
 
 
 def unusual_warnings(usual: Mapping[str, float], figures: Figures) -> tuple[str, ...]:

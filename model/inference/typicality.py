@@ -5,7 +5,8 @@ that the contours stay far from it. Both are held against what answers to sound 
 (`Manifest.typical`): the code of a sparse drawing is drawn towards the middle of the population, and has another
 density than one that was trained on a dense mask. A figure that is worse than usual by ``z`` SDs has the tail
 probability of Student's distribution, the predictive one for estimates from few shapes; the less probable one counts,
-doubled because two were looked at.
+doubled because two were looked at. More planes than were measured with take the code farther from the middle than any
+sparse drawing would: then the misfit is judged alone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,7 @@ from model.bundle import ShapeModel
 from model.inference.agreement import Section
 from model.inference.fitting import Fit
 from model.inference.mask_stack import Plane
-from model.inference.reliability import USUAL_PLANES, Figures
+from model.inference.reliability import MOST_USUAL_PLANES, USUAL_PLANES, Figures
 
 #: Below this percentile a shape is called unlike the population; below the other when it is by the density alone.
 ATYPICAL_PERCENTILE, ATYPICAL_BY_DENSITY = 0.1, 1.0
@@ -35,9 +36,12 @@ def typicality(model: ShapeModel, found: Fit, figures: Figures) -> tuple[float, 
     known = model.manifest.typical
     if not known:
         return density, float(100.0 * np.mean(model.population.log_densities < density))
-    tails = [_tail(known, (known["density_mean"] - density) / known["density_sd"])]
+    tails = []
+    if figures.planes <= MOST_USUAL_PLANES or not figures.misfit_mm > 0.0:
+        tails.append(_tail(known, (known["density_mean"] - density) / known["density_sd"]))
     if figures.misfit_mm > 0.0:
-        usual = known["misfit_mean"] + known["misfit_exponent"] * np.log(figures.planes / USUAL_PLANES)
+        share = min(figures.planes, MOST_USUAL_PLANES) / USUAL_PLANES
+        usual = known["misfit_mean"] + known["misfit_exponent"] * np.log(share)
         tails.append(_tail(known, (np.log(figures.misfit_mm) - usual) / known["misfit_sd"]))
     return density, 100.0 * min(1.0, len(tails) * min(tails))
 

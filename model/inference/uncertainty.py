@@ -13,6 +13,7 @@ from scipy.special import expit
 
 from model.bundle import ShapeModel
 from model.geometry import Grid
+from model.inference.discrepancy.levels import REACH_MM
 from model.inference.estimates import Estimate, estimate_of
 from model.inference.fitting import Fit
 from model.inference.member_moves import member_moves
@@ -33,6 +34,10 @@ from model.inference.surface import canonical_box
 
 #: Beyond this logit the posterior variance cannot move a probability visibly.
 SATURATED_LOGIT = 12.0
+#: A field that counts distances up to some reach only is decided beyond this share of it.
+DECIDED_SHARE = 0.9
+#: Voxels evaluated at a time; bounds memory.
+VOXELS_AT_A_TIME = 1 << 15
 #: Farther than this from the fit's surface (mm) no member of an ensemble has another label.
 FAR_MM = 8.0
 
@@ -139,15 +144,36 @@ def occupancy(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndar
 
 
 def _probabilities(model: ShapeModel, state: ShapeState, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    logits = fitted_logits(model, state.fits[0], points)
+    starts = range(0, len(points), VOXELS_AT_A_TIME)
+    return np.concatenate([_piece(model, state, points[start : start + VOXELS_AT_A_TIME]) for start in starts])
+
+
+def _piece(model: ShapeModel, state: ShapeState, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    found = state.fits[0]
+    logits, is_open = _logits(model, found, points)
     result = _sigmoid(logits)
-    open_points = np.abs(logits) < SATURATED_LOGIT
-    if state.covariance is not None and open_points.any():
-        found, near = state.fits[0], points[open_points]
+    if state.covariance is not None and is_open.any():
+        near = points[is_open]
         centre, by_parameter, _ = fitted_jacobians(model, found, near)
         variance = logit_variance(by_parameter, state.covariance) + open_variance(found, near)
-        result[open_points] = mean_probability(centre, variance)
+        result[is_open] = mean_probability(centre, variance)
     return result
+
+
+def _logits(
+    model: ShapeModel, found: Fit, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Logits of the field, and where they are not beyond doubt.
+
+    A discrepancy bounds them. Where it has nothing to object they are the code's own, so that the background is empty.
+    """
+    by_code, discrepancy = model_logits(model, found, points), found.discrepancy
+    if discrepancy is None:
+        return by_code, np.abs(by_code) < SATURATED_LOGIT
+    logits = discrepancy.corrected(by_code, found.pose.to_canonical(points))
+    agreed = logits * np.sign(by_code) >= DECIDED_SHARE * REACH_MM * discrepancy.slope
+    is_open = ~agreed | (np.abs(by_code) < SATURATED_LOGIT)
+    return np.where(is_open, logits, by_code), is_open
 
 
 def _member_probabilities(

@@ -69,6 +69,8 @@ def weights_of(lattice: CanonicalLattice) -> Float[np.ndarray, "i j k"]:
 
 def _slope(logits: Float[np.ndarray, "i j k"], step_mm: float) -> float | None:
     """Median slope (1/mm) of the field where it changes sign; None where it does not."""
+    if not (np.isfinite(logits).all() and logits.min() < 0.0 < logits.max()):
+        return None
     steepness = np.linalg.norm(np.stack(np.gradient(logits, step_mm)), axis=0)
     near = np.abs(logits) < step_mm * steepness
     return float(np.median(steepness[near])) if near.any() else None

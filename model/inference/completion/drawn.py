@@ -13,24 +13,28 @@ def drawn_at(
 ) -> Bool[np.ndarray, "2 n"]:
     """Which points lie on a drawn plane, inside what was drawn there (first row) or outside (second).
 
+    Of several planes the nearest one counts.
+
     Args:
         world: points (RAS mm).
         reach_mm: points this near to a plane lie on it: half a step of their lattice.
         stacks: the drawing.
         planes: those that count.
     """
-    found = np.zeros((2, len(world)), bool)
+    nearest, label = np.full(len(world), np.inf), np.zeros(len(world), bool)
     for plane in planes:
         stack = stacks[plane.stack]
         across = np.linalg.inv(stack.grid.affine)[plane.axis]
-        gap = (world @ across[:3] + across[3] - plane.index) / np.linalg.norm(across[:3])
-        rows = np.flatnonzero(np.abs(gap) <= reach_mm)
+        gap = np.abs(world @ across[:3] + across[3] - plane.index) / np.linalg.norm(across[:3])
+        rows = np.flatnonzero(gap <= np.minimum(reach_mm, nearest))
         voxels = np.rint(stack.grid.to_index(world[rows])).astype(int)
         voxels[:, plane.axis] = plane.index
         within = ((voxels >= 0) & (voxels < np.array(stack.grid.shape))).all(axis=1)
         rows, at = rows[within], tuple(voxels[within].T)
-        seen, inside = ~stack.excluded[at], stack.foreground[at]
-        found[0, rows[seen & inside]] = True
-        found[1, rows[seen & ~inside]] = True
-    found[1] &= ~found[0]
-    return found
+        seen = ~stack.excluded[at]
+        rows, inside = rows[seen], stack.foreground[at][seen]
+        # Of planes that are equally near the order does not matter.
+        label[rows] = inside | (label[rows] & (gap[rows] == nearest[rows]))
+        nearest[rows] = gap[rows]
+    drawn = np.isfinite(nearest)
+    return np.stack([drawn & label, drawn & ~label])

@@ -11,7 +11,7 @@ from model.bundle import Manifest, ShapeModel
 from model.inference.completion.completing import completed
 from model.inference.discrepancy.contours import contour_points
 from model.inference.discrepancy.covariance import Covariance
-from model.inference.discrepancy.grouping import cells_of, means_of
+from model.inference.discrepancy.grouping import cells_of, means_of, middle_of
 from model.inference.discrepancy.levels import Levels, saturated
 from model.inference.discrepancy.process import Discrepancy
 from model.inference.fitting import Fit
@@ -21,10 +21,11 @@ from model.inference.observations import Observations
 from model.inference.posterior import model_logits
 from model.inference.surface import canonical_box
 
-#: Contour points this close together (mm) are taken together ...
+#: Points of a contour this close together (mm) are taken together.
 CELL_MM = 1.5
-#: ... or farther, so that no more than this many are left.
-MOST_POINTS = 900
+#: Of more than this many, evenly spread ones are taken, this far (mm) apart or farther; means over larger cells would
+#: lie inside the object.
+MOST_POINTS, CLOSEST_MM = 900, 0.3
 #: Observations on the wrong side of the fitted surface count when they are farther than this from a contour (mm).
 CLEARLY_WRONG_MM = 1.5
 #: Planes are kept this far apart (mm) when distances within them are looked up.
@@ -110,7 +111,7 @@ def discrepancy_of(
     by_parameter = np.concatenate([by_latent, found.pose.jacobian(canonical, by_point)], axis=1)
     return Discrepancy(
         points=canonical,
-        residuals=saturated(seen.distances) - levels.at(logits, canonical),
+        residuals=saturated(seen.distances * np.exp(found.pose.log_scale)) - levels.at(logits, canonical),
         jacobian=by_parameter * levels.by_logit(logits)[:, None],
         covariance=prior.covariance,
         noise_mm=prior.noise_mm,
@@ -136,7 +137,7 @@ def observed_anew(model: ShapeModel, found: Fit, places: Sequence[Place]) -> lis
 
 @dataclass(frozen=True)
 class _Evidence:
-    """World points (mm) and their signed distances from the drawn contour (mm, positive inside)."""
+    """World points and their signed distances from the drawn contour (world mm, positive inside; 0 on it)."""
 
     points: Float[np.ndarray, "n 3"]
     distances: Float[np.ndarray, "n"]
@@ -158,9 +159,11 @@ def _evidence(model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observ
     if not len(points):
         return wrong
     kinds = np.concatenate([plane_of + 1, np.zeros(len(wrong.distances), int)])
-    cells = _few_cells(found.pose.to_canonical(points), kinds)
+    cells = cells_of(found.pose.to_canonical(points), CELL_MM, kinds)
     distances = np.concatenate([np.zeros(len(contour)), wrong.distances])
-    return _Evidence(means_of(cells, points), means_of(cells, distances[:, None])[:, 0])
+    means = _Evidence(means_of(cells, points), means_of(cells, distances[:, None])[:, 0])
+    chosen = _spread_out(found.pose.to_canonical(means.points), means.distances != 0.0)
+    return _Evidence(means.points[chosen], means.distances[chosen])
 
 
 def _wrong_side(
@@ -186,10 +189,13 @@ def _wrong_side(
     return _Evidence(observations.points[chosen], np.where(inside[chosen], distance[clear], -distance[clear]))
 
 
-def _few_cells(points: Float[np.ndarray, "n 3"], kinds: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    size = CELL_MM
+def _spread_out(points: Float[np.ndarray, "n 3"], kinds: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:
+    """Points (canonical mm) of both kinds that are left of too many, one of each cell."""
+    if len(points) <= MOST_POINTS:
+        return np.arange(len(points))
+    size = CLOSEST_MM
     while True:
-        cells = cells_of(points, size, kinds)
+        cells = cells_of(points, size, kinds.astype(int))
         if cells.max() < MOST_POINTS:
-            return cells
+            return middle_of(cells, points)
         size *= 1.15

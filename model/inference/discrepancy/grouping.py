@@ -19,3 +19,10 @@ def means_of(cells: Int[np.ndarray, "n"], values: Float[np.ndarray, "n k"]) -> F
     """Mean of the rows of each cell."""
     counts = np.bincount(cells)
     return np.stack([np.bincount(cells, column) / counts for column in values.T], axis=1)
+
+
+def middle_of(cells: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "c"]:
+    """Number of each cell's point that lies nearest to the mean of all of them."""
+    distances = np.square(points - means_of(cells, points)[cells]).sum(axis=1)
+    order = np.lexsort((distances, cells))
+    return np.asarray(order[np.flatnonzero(np.diff(cells[order], prepend=-1))])

@@ -12,6 +12,7 @@ from model.inference.mesh import Mesh
 from model.inference.observations import observe
 from model.inference.reconstruction import Options, reconstruct
 from model.inference.reliability import (
+    MOST_USUAL_PLANES,
     ROUGH_SHARE,
     Figures,
     highest_usual,
@@ -88,6 +89,11 @@ def test_figures_are_told_above_what_is_usual_for_as_many_planes(name, planes):
     assert unusual_warnings(USUAL, replace(sound, **{f"{name}_mm": 0.99 * highest})) == ()
     (sentence,) = unusual_warnings(USUAL, replace(sound, **{f"{name}_mm": 1.01 * highest}))
     assert f"{highest:.2f} mm" in sentence
+
+
+def test_more_planes_than_were_measured_with_are_judged_like_the_most():
+    for name in ("misfit", "surface_sd"):
+        assert highest_usual(USUAL, name, 60) == highest_usual(USUAL, name, MOST_USUAL_PLANES)
 
 
 def test_more_planes_leave_the_surface_less_uncertain():

@@ -11,7 +11,7 @@ from model.inference.agreement import Section, sections_of
 from model.inference.fitting import FitOptions, fit
 from model.inference.observations import Plane
 from model.inference.posterior import fitted_logits
-from model.inference.reliability import Figures
+from model.inference.reliability import MOST_USUAL_PLANES, Figures
 from model.inference.typicality import (
     predictive_probabilities,
     predictive_warnings,
@@ -68,6 +68,14 @@ def test_a_usual_shape_is_typical_with_any_number_of_planes():
         assert percentile(usual, planes) > 20.0
         assert typicality_warnings(MODEL, percentile(6.0 * usual, planes)) != ()
         assert typicality_warnings(MODEL, percentile(1.5 * usual, planes)) == ()
+
+
+def test_of_more_planes_than_were_measured_with_the_misfit_counts_alone():
+    far = np.array([6.0, 0.0, 0.0])
+    assert typicality_warnings(MODEL, percentile(USUAL, MOST_USUAL_PLANES, latent=far)) != ()
+    assert percentile(USUAL, 34, latent=far) > 20.0
+    assert typicality_warnings(MODEL, percentile(6.0 * USUAL, 34, latent=far)) != ()
+    assert typicality_warnings(MODEL, percentile(0.0, 34, latent=far)) != ()
 
 
 def test_a_misfit_that_was_not_looked_at_does_not_count():

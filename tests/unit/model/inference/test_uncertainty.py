@@ -1,5 +1,6 @@
 """Spread of figures, surfaces and voxels against draws of analytic ellipsoids."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.special import expit
 
 from model.geometry import POSE_SIZE, Grid, Pose
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, with_discrepancy
 from model.inference.estimates import Estimate, interval_reach
 from model.inference.fitting import Fit, FitOptions, FitStatus, fit
 from model.inference.mesh import (
@@ -22,6 +24,7 @@ from model.inference.mesh import (
 )
 from model.inference.posterior import (
     fitted_jacobians,
+    fitted_logits,
     laplace_covariance,
     logit_variance,
     mean_probability,
@@ -289,3 +292,35 @@ def test_calibrated_spread_is_wider_and_shares_an_offset():
     areas = vertex_areas(MESH)
     expected = np.hypot(1.5 * plain.sd_of(areas), 0.3 * areas.sum())
     assert wide.sd_of(areas) == pytest.approx(expected, rel=1e-6)
+
+
+def held_fit():
+    """An ellipsoid, drawn in three planes, that contours hold."""
+    stack = drawn(Ellipsoid((14.0, 9.0, 7.0), CENTRE), cube_around(CENTRE))
+    observations = observed(stack)
+    found = fit(MODEL, observations, FitOptions())
+    return with_discrepancy(MODEL, found, [stack], observations, DiscrepancyPrior(0.6, 0.7))
+
+
+@pytest.mark.parametrize("uncertain", [True, False])
+def test_the_background_is_empty_and_the_core_full_though_the_contours_bound_the_field(uncertain):
+    found = held_fit()
+    state = ShapeState((found,), laplace_covariance(found) if uncertain else None)
+    grid = cube_around(CENTRE)
+    values = occupancy(MODEL, state, grid).reshape(-1)
+    distance = Ellipsoid((14.0, 9.0, 7.0), CENTRE).logits(grid.centres())
+    assert values[distance < -8.0].max() < 1e-3
+    assert values.sum() == pytest.approx((distance > 0).sum(), rel=0.05)
+    near = np.abs(distance) < 1.5
+    exact = expit(fitted_logits(MODEL, found, grid.centres()[near]))
+    assert np.abs(values[near] - exact).max() < (0.4 if uncertain else 1e-6)
+
+
+def test_the_memory_of_a_map_does_not_grow_with_the_parameters():
+    found, nodes = held_fit(), 121
+    tracemalloc.start()
+    grid = cube_around(CENTRE, step=40.0 / nodes, nodes=nodes)
+    occupancy(MODEL, ShapeState((found,), laplace_covariance(found)), grid)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200 * nodes**3

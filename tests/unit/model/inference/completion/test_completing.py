@@ -67,8 +67,11 @@ class TestWhatItSees:
 
 class TestWhatBecomesOfIt:
     def test_nothing_where_there_is_no_network_or_it_has_no_weight_or_finds_nothing(self):
-        empty = KnownCompleter(lambda points: np.full(len(points), -3.0))
-        for model in (MODEL, completing(MODEL, BallCompleter(8.0), 0.0), completing(MODEL, empty, 0.5)):
+        flat = KnownCompleter(lambda points: np.full(len(points), -3.0))
+        steep = KnownCompleter(lambda points: np.minimum(-0.2, sphere(9.0).logits(points) - 10.0))
+        broken = KnownCompleter(lambda points: np.where(points[:, 0] > 5.0, np.nan, sphere(9.0).logits(points)))
+        without = [completing(MODEL, network, 0.5) for network in (flat, steep, broken)]
+        for model in (MODEL, completing(MODEL, BallCompleter(8.0), 0.0), *without):
             assert completed(model, FOUND, [STACK], OBSERVATIONS, SLOPE) is None
         np.testing.assert_array_equal(
             answer(completing(MODEL, BallCompleter(8.0), 0.0)).mesh.vertices, answer(MODEL).mesh.vertices

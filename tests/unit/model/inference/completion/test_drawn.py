@@ -43,6 +43,26 @@ def test_no_point_is_both_where_planes_cross():
     assert not found.all(axis=0).any()
 
 
+def test_of_planes_close_together_the_nearest_one_counts_in_any_order():
+    """Between two planes of which one shows the shape and the other one does not."""
+    stack = drawn(SHAPE, cube_around(CENTRE), [Plane(0, 2, 20)])
+    planes = [Plane(0, 2, 20), Plane(0, 2, 21)]
+    points = CENTRE + np.array([[0.0, 0.0, height] for height in (0.1, 0.4, 0.6, 0.9)])
+    for order in (planes, planes[::-1]):
+        found = drawn_at(points, 2.0, [stack], order)
+        np.testing.assert_array_equal(found[0], [True, True, False, False])
+        np.testing.assert_array_equal(found[1], ~found[0])
+
+
+def test_many_close_planes_do_not_thicken_what_is_drawn():
+    grid = cube_around(CENTRE, step=0.35, nodes=91)
+    stack = drawn(SHAPE, grid, [Plane(0, 2, index) for index in range(91)])
+    points = CENTRE + np.random.default_rng(2).uniform(-12.0, 12.0, (20_000, 3))
+    found = drawn_at(points, 0.6, [stack], [Plane(0, 2, index) for index in range(91)])
+    clear = np.abs(SHAPE.logits(points)) > 0.4
+    np.testing.assert_array_equal(found[0][clear], SHAPE.logits(points)[clear] > 0)
+
+
 def test_what_was_never_looked_at_and_what_lies_off_the_image_was_not_drawn():
     grid = cube_around(CENTRE)
     whole = drawn(SHAPE, grid)

@@ -5,12 +5,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_of, with_discrepancy
+from model.inference.discrepancy.conditioning import (
+    CELL_MM,
+    MOST_POINTS,
+    DiscrepancyPrior,
+    discrepancy_of,
+    with_discrepancy,
+)
 from model.inference.discrepancy.conditioning import corrected as under
+from model.inference.discrepancy.contours import contour_points
+from model.inference.discrepancy.grouping import cells_of, means_of
 from model.inference.fitting import FitOptions, fit
 from model.inference.observations import Plane, find_planes, observe
 from model.inference.posterior import fitted_jacobians, fitted_logits, model_logits
 from tests.analytic_model import ellipsoid_model
+from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import PARALLEL, cube_around, drawn, rotation
 
 CENTRE = np.array([30.0, -20.0, 50.0])
@@ -158,3 +167,26 @@ def test_variance_is_divided_between_shape_and_annotator(fidelity):
     prior = DiscrepancyPrior(0.7, fidelity)
     assert prior.covariance.variance == pytest.approx(fidelity * 0.49)
     assert prior.covariance.variance + prior.noise_mm**2 == pytest.approx(0.49, abs=0.011)
+
+
+def test_many_planes_leave_points_on_the_contours_themselves():
+    """A thin shape, drawn on 81 planes a quarter of a millimetre apart: more than are taken."""
+    thin = Ellipsoid((12.0, 9.0, 1.5), CENTRE)
+    planes = [Plane(0, 0, index) for index in range(16, 105)]
+    stack = drawn(thin, cube_around(CENTRE, step=0.25, nodes=121), planes)
+    observations = observe([stack], planes, budget=2500, seed=0)
+    found = fit(MODEL, observations, FitOptions(robust=False))
+    made = discrepancy_of(MODEL, found, [stack], observations, DiscrepancyPrior())
+    assert MOST_POINTS / 2 < len(made.points) <= MOST_POINTS
+    depths = thin.logits(found.pose.to_world(made.points))
+    assert abs(np.mean(depths)) < 0.05
+    assert np.quantile(np.abs(depths), 0.95) < 0.3
+
+
+def test_points_of_few_planes_are_means_of_neighbours():
+    made = corrected(DiscrepancyPrior()).discrepancy
+    contour, plane_of = contour_points([STACK], OBSERVATIONS.planes)
+    canonical = FOUND.pose.to_canonical(contour)
+    cells = cells_of(canonical, CELL_MM, plane_of)
+    assert len(made.points) == cells.max() + 1
+    np.testing.assert_allclose(np.sort(made.points, axis=0), np.sort(means_of(cells, canonical), axis=0), atol=1e-9)
