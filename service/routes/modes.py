@@ -10,10 +10,9 @@ from model.bundle import ShapeModel
 from service import use_cases
 from service.mode_presentation import mode_list
 from service.mode_schemas import ModeList, ModeMeshQuery, ModeQuery, ShapeQuery, parse_coordinates
-from service.ports import Ticket
 from service.routes.caching import cached, caching_headers, is_held, not_modified
 from service.routes.connection import run_while_connected
-from service.routes.dependencies import Services, WithModel, WithServices, WithTicket, address
+from service.routes.dependencies import Services, WithModel, WithServices, address
 from service.routes.meshes import model_metadata
 from service.routes.models import PATH
 from service.routes.responses import MESH_MEDIA_TYPES, Responses, attachment, files, problems
@@ -47,12 +46,13 @@ def modes_router() -> APIRouter:
     return router
 
 
-async def list_modes(request: Request, model: WithModel, services: WithServices, ticket: WithTicket) -> Response:
+async def list_modes(request: Request, model: WithModel, services: WithServices) -> Response:
     """Dimensions of the flow's base, ranked by how far one standard deviation moves the mean surface."""
     headers = caching_headers(services, model, "modes", address(request, ""))
     if is_held(request, headers):
         return not_modified(headers)
-    modes = await run_while_connected(request, ticket, lambda _: services.modes(model))
+    with services.engine.admit() as ticket:
+        modes = await run_while_connected(request, ticket, lambda _: services.modes(model))
     place = address(request, f"{PATH}/{model.manifest.name}/modes")
     return JSONResponse(mode_list(model, modes, place).model_dump(mode="json"), headers=headers)
 
@@ -63,10 +63,9 @@ async def read_mode(
     request: Request,
     model: WithModel,
     services: WithServices,
-    ticket: WithTicket,
 ) -> Response:
     """The mean shape moved `sd` standard deviations along the mode; vertices carry the displacement by one more."""
-    return await _mesh(request, services, ticket, model, {rank: query.sd}, query)
+    return await _mesh(request, services, model, {rank: query.sd}, query)
 
 
 async def read_shape(
@@ -74,16 +73,14 @@ async def read_shape(
     request: Request,
     model: WithModel,
     services: WithServices,
-    ticket: WithTicket,
 ) -> Response:
     """The mean shape moved along several modes at once; vertices carry the distance to the mean."""
-    return await _mesh(request, services, ticket, model, parse_coordinates(query.mode), query)
+    return await _mesh(request, services, model, parse_coordinates(query.mode), query)
 
 
 async def _mesh(
     request: Request,
     services: Services,
-    ticket: Ticket,
     model: ShapeModel,
     coordinates: Mapping[int, float],
     query: ModeMeshQuery,
@@ -92,7 +89,8 @@ async def _mesh(
     headers = caching_headers(services, model, "shape", where, query.format.value, query.spacing_mm)
     if is_held(request, headers):
         return not_modified(headers)
-    data = await run_while_connected(request, ticket, lambda _: _bytes(services, model, coordinates, query))
+    with services.engine.admit() as ticket:
+        data = await run_while_connected(request, ticket, lambda _: _bytes(services, model, coordinates, query))
     name = f"{model.manifest.name}-shape.{query.format.value}"
     return Response(data, media_type=MESH_MEDIA_TYPES[query.format], headers=headers | attachment(name))
 

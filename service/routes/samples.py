@@ -54,7 +54,6 @@ async def read_sample(
     request: Request,
     model: WithModel,
     services: WithServices,
-    ticket: WithTicket,
 ) -> Response:
     """A pure function of the model's digest, the seed and the query: cacheable for ever."""
     headers = caching_headers(services, model, "sample", seed, query)
@@ -65,7 +64,8 @@ async def read_sample(
     def made(watch: Watch) -> SampleFile:
         return services.compute(make_sample, model, writer, seed, how, check=partial(watch, "evaluation"))
 
-    file = await run_while_connected(request, ticket, made)
+    with services.engine.admit() as ticket:
+        file = await run_while_connected(request, ticket, made)
     return Response(file.data, media_type=sample_media_type(query.format), headers=headers | attachment(file.name))
 
 

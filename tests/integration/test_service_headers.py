@@ -1,8 +1,10 @@
 """Headers: repeated lines, methods that are allowed, answers without a body, and copies that a client holds."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
-from tests.service_parts import NAME, app_for, mask_parts, problem, running
+from tests.service_parts import NAME, app_for, gated_model, mask_parts, problem, running
 
 RECONSTRUCTIONS = "/v1/reconstructions"
 SAMPLE = f"/v1/models/{NAME}/samples/1"
@@ -75,3 +77,20 @@ def test_head_of_results_problems_and_streams(client, links):
     assert counted in figures
     assert 'status="500"' not in figures
     assert client.get("/readyz").status_code == 200
+
+
+def test_a_copy_that_is_held_is_confirmed_while_too_much_work_waits(tmp_path):
+    model, decoder = gated_model()
+    paths = [SAMPLE, *(f"/v1/models/{NAME}/{path}" for path in ("modes", "modes/1", "shape?mode=1:2"))]
+    with running(app_for(tmp_path, model, workers=1, max_waiting=0)) as client, ThreadPoolExecutor(1) as pool:
+        decoder.gate.set()
+        held = {path: client.get(path).headers["etag"] for path in paths}
+        decoder.gate.clear()
+        decoder.entered.clear()
+        busy = pool.submit(client.get, f"/v1/models/{NAME}/samples/2")
+        assert decoder.entered.wait(30.0)
+        for path, tag in held.items():
+            assert client.get(path).status_code == 503
+            assert client.get(path, headers={"If-None-Match": tag}).status_code == 304
+        decoder.gate.set()
+        assert busy.result(30.0).status_code == 200
