@@ -6,7 +6,7 @@ from model.errors import InvalidParameter
 from model.inference.modes import FARTHEST_SD
 from service.ports import MeshFormat
 from service.request_schemas import SpacingMm
-from service.schemas import ActiveDimensions, ModelReference
+from service.schemas import ModelReference
 
 
 class ModeMeshQuery(BaseModel):
@@ -54,11 +54,19 @@ class ModeSchema(BaseModel):
     link: str = Field(description="the surface along this mode")
 
 
+class ActiveModes(BaseModel):
+    """How many modes, by rank, explain so much of the variance of the surface."""
+
+    percent_95: int
+    percent_97: int
+    percent_99: int
+
+
 class ModeList(BaseModel):
     """Modes of a model by rank."""
 
     model: ModelReference
-    active_dimensions: ActiveDimensions = Field(description="counted by the surface's variance")
+    active_dimensions: ActiveModes
     modes: list[ModeSchema]
 
 

@@ -79,3 +79,12 @@ def test_masks_are_described_as_files(document):
     assert form["additionalProperties"] is False
     assert form["required"] == ["mask"]
     assert form["properties"]["mask"]["items"]["type"] == "string"
+
+
+def test_active_dimensions_say_of_which_variance_they_are(document):
+    schemas = document["components"]["schemas"]
+    names = [schemas[owner]["properties"]["active_dimensions"]["$ref"] for owner in ("ModelDescription", "ModeList")]
+    of_base, of_surface = (schemas[name.rsplit("/", 1)[1]] for name in names)
+    assert of_base["properties"].keys() == of_surface["properties"].keys()
+    assert "base" in of_base["description"]
+    assert "surface" in of_surface["description"]
