@@ -13,6 +13,7 @@ from model.errors import InvalidParameter
 from model.inference.calipers import USUAL_TEXT, parse_extents
 from model.inference.fitting import MirrorRule
 from model.inference.reconstruction import UncertaintyRule
+from model.inference.stacks import checked_labels
 from model.inference.surface import require_step
 from service import use_cases
 from service.commands import ExtentsOption, FidelityOption, ForceOption, JsonOption, ModelOption, RejectOption
@@ -22,7 +23,7 @@ from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobState, JobStatus
 from service.job_presentation import job_summary
 from service.job_results import write_zip
-from service.job_submission import JobDesk
+from service.job_submission import JobDesk, require_first_stack
 from service.jobs.reconstructions import zip_of_folder
 from service.jobs.worker import supervised_workers
 from service.model_registry import pinned_name
@@ -102,7 +103,7 @@ def reconstruct_job(
 ) -> None:
     """Reconstruct each mask of a folder or a ZIP."""
     require_free({"--output": output}, force=force)
-    parse_annotated(annotated), parse_labels(label or []), parse_extents(extents)
+    checked_labels(parse_labels(label or [])), parse_extents(extents)
     settings = load_settings()
     chosen = context.obj(settings).get(model)
     require_step(chosen, resolution_mm, settings.max_voxels, part="resolution_mm")
@@ -118,7 +119,9 @@ def reconstruct_job(
         "fidelity": fidelity,
         "extents": extents,
     }
-    _begin(settings, RECONSTRUCTIONS_JOB, argument, _archive(masks), key, output, as_json=as_json)
+    archive = _archive(masks)
+    require_first_stack(parse_annotated(annotated), archive)
+    _begin(settings, RECONSTRUCTIONS_JOB, argument, archive, key, output, as_json=as_json)
 
 
 def watch_job(identifier: IdArgument, output: OutputOption = None, force: ForceOption = False) -> None:

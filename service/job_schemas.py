@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from model.errors import InvalidParameter
 from model.inference.calipers import USUAL_TEXT, parse_extents
+from model.inference.stacks import checked_labels
 from service.job_ports import JobState
 from service.ports import RECONSTRUCTIONS_JOB, SAMPLES_JOB, MeshFormat, SampleFormat
 from service.request_schemas import Seed, SpacingMm, parse_annotated, parse_labels
@@ -70,7 +71,7 @@ class JobForm(BaseModel):
         if self.format.value not in tuple(MeshFormat):
             raise InvalidParameter(f"The parameter format must be one of: {', '.join(MeshFormat)}.", part="format")
         parse_annotated(self.annotated)
-        parse_labels(self.label)
+        checked_labels(parse_labels(self.label))
         parse_extents(self.extents)
         return self.model_dump(include=set(_OF_RECONSTRUCTIONS) - {"archive"})
 

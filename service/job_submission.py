@@ -1,12 +1,16 @@
 """How something asked for becomes a job: once for each key, within a bound on their number, its inputs kept first."""
 
 import hashlib
+import io
 import json
+import zipfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from model.errors import InvalidParameter
+from model.inference.observations import AnnotatedRule, Plane
 from service.errors import Overloaded, StoreFull, UnknownJob
 from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobStatus
@@ -65,6 +69,22 @@ class JobDesk:
         except OSError as fault:
             files.remove()
             raise StoreFull("What was sent cannot be kept now; send the request again later.") from fault
+
+
+def require_stacks(annotated: AnnotatedRule | Sequence[Plane], count: int) -> None:
+    """Refuse planes of stacks that are not there, before anything is read: `InvalidParameter`."""
+    for position, plane in enumerate(() if isinstance(annotated, str) else annotated):
+        if plane.stack >= count:
+            part = f"annotated[{position}]"
+            raise InvalidParameter(f"{part} names stack {plane.stack}; 0 to {count - 1} is accepted", part=part)
+
+
+def require_first_stack(annotated: AnnotatedRule | Sequence[Plane], archive: bytes) -> None:
+    """Refuse planes of other stacks than the first of each mask of an archive; DICOM objects may have several."""
+    with suppress(zipfile.BadZipFile), zipfile.ZipFile(io.BytesIO(archive)) as opened:
+        if any(name.lower().endswith(".dcm") for name in opened.namelist()):
+            return
+    require_stacks(annotated, 1)
 
 
 def _fingerprint(argument: Mapping[str, Any], inputs: Sequence[bytes]) -> str:

@@ -16,6 +16,8 @@ from service.ports import MeshFormat, SampleFormat
 from service.use_cases import MAX_SEED
 
 SpacingMm = Annotated[float, Field(ge=0.25, le=10.0, allow_inf_nan=False, description="grid step (mm)")]
+#: Largest label; masks of 32 bits hold it.
+MAX_LABEL = 2**31 - 1
 #: Description of the part `extents`.
 EXTENTS = (
     "extents of the surface to measure, separated by commas: R, A and S along the axes of the body, longest between "
@@ -180,11 +182,12 @@ def parse_labels(texts: list[str]) -> frozenset[int] | None:
     """The `label` parameter: repeated, separated by commas, or not there.
 
     Raises:
-        InvalidParameter: not whole numbers from 1 to 65535.
+        InvalidParameter: not whole numbers from 1 to `MAX_LABEL`.
     """
     words = [word.strip() for text in texts for word in text.split(",") if text.strip()]
     if not words:
         return None
-    if not all(word.isascii() and word.isdecimal() and len(word) <= 5 and 1 <= int(word) <= 65535 for word in words):
-        raise InvalidParameter("The parameter label must be whole numbers from 1 to 65535.", part="label")
-    return frozenset(map(int, words))
+    numbers = [int(word) for word in words if word.isascii() and word.isdecimal() and len(word) <= 10]
+    if len(numbers) < len(words) or not all(1 <= number <= MAX_LABEL for number in numbers):
+        raise InvalidParameter(f"The parameter label must be whole numbers from 1 to {MAX_LABEL}.", part="label")
+    return frozenset(numbers)

@@ -17,7 +17,9 @@ from service.job_ports import JobState, JobStatus
 from service.job_presentation import job_summary
 from service.job_results import MANIFEST, result_members
 from service.job_schemas import JobForm, JobSummary
+from service.job_submission import require_first_stack
 from service.ports import RECONSTRUCTION_JOB, SAMPLES_JOB
+from service.request_schemas import parse_annotated
 from service.routes.dependencies import Services, WithServices, address
 from service.routes.job_requests import (
     JOB_ACCEPTED,
@@ -100,6 +102,8 @@ def create_job(
     argument = form.argument(submittable_model(services, form.model))
     _require_feasible(services, form.kind, argument)
     inputs = [] if form.archive is None else [form.archive.file.read()]
+    for archive in inputs:
+        require_first_stack(parse_annotated(form.annotated), archive)
     return accepted_job(request, submit(services, form.kind, argument, inputs, key))
 
 
@@ -131,7 +135,8 @@ def read_result(identifier: Identifier, request: Request, services: WithServices
     if status.state is JobState.CANCELLED:
         raise Cancelled("The job was cancelled, so it has no result.")
     if status.state is not JobState.DONE or status.result is None:
-        raise NotReady(f"The job has no result: it is {status.state.value}.")
+        why = f" {status.problem}" if status.problem else ""
+        raise NotReady(f"The job has no result: its state is {status.state.value}.{why}")
     if status.kind == RECONSTRUCTION_JOB:
         return RedirectResponse(address(request, f"/v1/reconstructions/{identifier}"), 303)
     chunks = _zip(JobFiles(services.blobs, identifier), status.kind, status.result["count"])

@@ -1,18 +1,23 @@
 """Errors as ``application/problem+json`` (RFC 9457): one shape for everything that goes wrong."""
 
+import re
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel
+from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Match, Mount
 
-from model.errors import InputError, InvalidParameter, MorphoFlowError
+from model.errors import InputError, InvalidParameter, MorphoFlowError, TooLarge
 from service.errors import PROTOCOL_KINDS, HelperLost, Kind, Overloaded, Unauthorised, kind_of
 from service.schemas import Problem
 
+#: What the reader of multipart bodies says of one beyond its own limits.
+_TOO_MANY = re.compile(r"Too many (files|fields)\. Maximum number of \w+ is (\d+)\.")
+_TOO_LONG = re.compile(r"(?:Part|Field) exceeded maximum size of (\d+)KB\.")
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 #: Methods that a route may take; HEAD goes with GET.
 METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
@@ -76,6 +81,9 @@ def internal_error(request_id: str) -> Response:
 def _protocol(request: Request, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
         raise error
+    limit = _multipart_limit(error.detail) if error.status_code == 400 else None
+    if limit is not None:
+        return respond_to(limit, request_id=request_id_of(request), retry_after_s=0)
     kind = PROTOCOL_KINDS.get(error.status_code, PROTOCOL_KINDS[400])
     headers = dict(error.headers) if error.headers else {}
     if kind.status == 405:
@@ -83,11 +91,20 @@ def _protocol(request: Request, error: Exception) -> Response:
     return problem_response(kind, PROTOCOL_SENTENCES[kind.status], request_id=request_id_of(request), headers=headers)
 
 
+def _multipart_limit(said: str) -> TooLarge | None:
+    """What is too large of a body that the reader of multipart bodies gave up."""
+    if found := _TOO_MANY.match(said):
+        kind, count = ("files" if found[1] == "files" else "parts that are no file"), found[2]
+        return TooLarge(f"The request's body must not hold more than {count} {kind}.", part="body")
+    if found := _TOO_LONG.match(said):
+        return TooLarge(f"A part that is no file must not be larger than {found[1]} KiB.", part="body")
+    return None
+
+
 def allowed_methods(request: Request) -> list[str]:
     """Methods of all routes at the path of a request; whatever answers GET answers HEAD."""
-    routes = [
-        route for route in request.app.routes if not isinstance(route, Mount)
-    ]  # a folder of files takes GET alone
+    # Folders of files take GET alone.
+    routes = [route for route in request.app.routes if not isinstance(route, Mount)]
     asked = [{**request.scope, "method": method} for method in METHODS]
     found = {one["method"] for one in asked if any(route.matches(one)[0] is Match.FULL for route in routes)} or {"GET"}
     return sorted(found | {"HEAD"} if "GET" in found else found)
@@ -111,6 +128,10 @@ def _sentence(request: Request, fault: dict[str, Any]) -> tuple[str, str]:
             return part, f"There is no such parameter; accepted are: {', '.join(accepted_names(request))}."
         case "missing":
             return part, f"The parameter {part} is missing."
+        case "value_error" if "UploadFile" in fault["msg"]:
+            return part, f"The part {part} must be a file; with curl: -F {names[0]}=@FILE."
+        case _ if isinstance(fault.get("input"), UploadFile):
+            return part, f"The part {part} must be text, no file; with curl: -F {names[0]}=VALUE."
         case _:
             reason = str(fault["msg"]).removeprefix("Value error, ")
             return part, f"The parameter {part} is not valid: {reason[:1].lower()}{reason[1:]}."

@@ -10,8 +10,11 @@ from starlette.responses import JSONResponse, Response
 from model.errors import InvalidParameter, TooLarge, UnknownModel
 from model.inference.observations import MaskStack
 from model.inference.reconstruction import Watch
+from model.inference.stacks import checked_labels
 from model.inference.surface import require_step
 from service import use_cases
+from service.adapters.images import image_format
+from service.job_submission import require_stacks
 from service.observability import StageTimer
 from service.ports import RECONSTRUCTION_JOB, MeshFormat, StoredResult
 from service.presentation import result_summary
@@ -93,7 +96,9 @@ async def create_reconstruction(
 def _enqueue(request: Request, services: Services, form: ReconstructionForm, key: str | None) -> Response:
     model = submittable_model(services, form.model)
     options = form.options()
-    parse_labels(form.label)
+    checked_labels(parse_labels(form.label))
+    if all(image_format(mask.file) != "dicom" for mask in form.mask):  # an object of DICOM may be several stacks
+        require_stacks(options.annotated, len(form.mask))
     step, limit = options.resolution_mm, services.settings.max_voxels
     require_step(services.registry.get(model), step, limit, part="resolution_mm")
     argument = form.model_dump(exclude={"mask", "model"}) | {"model": model, "masks": len(form.mask)}

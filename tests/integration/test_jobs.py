@@ -93,7 +93,9 @@ def test_an_input_at_fault_fails_the_job_with_its_sentence(client):
     summary = ended(client, accepted.headers["location"])
     assert summary["state"] == "failed"
     assert "mask[0]" in summary["problem"]
-    assert client.get(f"{accepted.headers['location']}/result").status_code == 409
+    refused = client.get(f"{accepted.headers['location']}/result")
+    assert refused.status_code == 409
+    assert refused.json()["detail"].endswith(summary["problem"])
 
 
 def test_the_same_key_leads_to_the_same_job_and_another_request_is_refused(client):
