@@ -68,12 +68,18 @@ def write_mesh(mesh: Mesh, format: str, *, space: str = "RAS", metadata: Mapping
 
 def colours(values: Float[np.ndarray, "v"]) -> UInt8[np.ndarray, "v 4"]:
     """RGBA of scalars from zero to their maximum, and alike to both sides of zero where there are negative ones."""
-    top, signed = float(np.abs(values).max()), bool((values < 0).any())
-    ramp = SIGNED_RAMP if signed else RAMP
-    stops = np.linspace(-1.0 if signed else 0.0, 1.0, len(ramp))
+    low, top = colour_range(values)
+    ramp = SIGNED_RAMP if low < 0 else RAMP
+    stops = np.linspace(-1.0 if low < 0 else 0.0, 1.0, len(ramp))
     place = values / top if top > 0 else np.zeros(len(values))
     channels = [np.interp(place, stops, [colour[channel] for colour in ramp]) for channel in range(3)]
     return np.asarray(np.rint(np.stack([*channels, np.full(len(values), 255.0)], axis=1)), np.uint8)
+
+
+def colour_range(values: Float[np.ndarray, "v"]) -> tuple[float, float]:
+    """Scalars at the first and the last colour of the ramp."""
+    top = float(np.abs(values).max())
+    return (-top if (values < 0).any() else 0.0), top
 
 
 def _placed(mesh: Mesh, space: str) -> Mesh:
@@ -124,7 +130,8 @@ def _glb(mesh: Mesh, said: Mapping[str, str]) -> bytes:
     if mesh.scalars:
         name, shown = next(iter(mesh.scalars.items()))
         body.visual = trimesh.visual.ColorVisuals(body, vertex_colors=colours(shown))
-        body.metadata["colours"] = f"{name} from 0 to {float(shown.max()):.4g}"
+        low, high = colour_range(shown)
+        body.metadata["colours"] = f"{name} from {low:.4g} to {high:.4g}"
     scene = trimesh.Scene(base_frame="world")
     scene.add_geometry(body, node_name="surface", geom_name="surface", transform=_to_gltf(said["space"]))
     write: Any = export_glb

@@ -151,11 +151,11 @@ def _affine(fields: dict[str, Any], part: str, first_axis: int) -> Float[np.ndar
             affine[:3, :3] = directions.T
         else:
             affine[:3, :3] = np.diag(np.asarray(fields["spacings"], dtype=float)[axes])
-        affine[:3, 3] = fields.get("space origin", np.zeros(3))
     except (KeyError, ValueError, TypeError) as error:
         raise InvalidGeometry(
             f"{part} names no voxel spacing; three space directions or spacings in mm are needed", part=part
         ) from error
+    affine[:3, 3] = _origin(fields, part)
     affine[:3] *= _unit(fields, part)
     result: Float[np.ndarray, "4 4"] = TO_RAS[space] @ affine
     return result
@@ -163,6 +163,18 @@ def _affine(fields: dict[str, Any], part: str, first_axis: int) -> Float[np.ndar
 
 def _row(direction: Any) -> Float[np.ndarray, "3"]:
     return np.full(3, np.nan) if direction is None else np.asarray(direction, dtype=float)
+
+
+def _origin(fields: dict[str, Any], part: str) -> Float[np.ndarray, "3"]:
+    try:
+        origin = np.asarray(fields.get("space origin", np.zeros(3)), dtype=float)
+    except (ValueError, TypeError):
+        origin = np.zeros(0)
+    if origin.shape != (3,):
+        raise InvalidGeometry(
+            f"{part} has a malformed space origin; three numbers such as (1,2,3) are needed", part=part
+        )
+    return origin
 
 
 def _unit(fields: dict[str, Any], part: str) -> float:

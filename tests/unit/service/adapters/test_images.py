@@ -284,3 +284,10 @@ def test_real_masks_read_as_nibabel_reads_them(shared_data):
         stack = read_mask(path, "mask[0]", limits)
         np.testing.assert_array_equal(stack.foreground, np.asanyarray(image.dataobj) != 0)
         np.testing.assert_allclose(stack.grid.affine, image.affine, atol=1e-9)
+
+
+@pytest.mark.parametrize("origin", [b"(1,2)", b"(1,2,3,4)"])
+def test_a_malformed_origin_of_nrrd_is_named(origin):
+    data = nrrd_text("6 7 8").replace(b"space origin: (0,0,0)", b"space origin: " + origin)
+    with pytest.raises(InputError, match=r"mask\[0\] has a malformed space origin"):
+        read_mask(data, "mask[0]", LIMITS)

@@ -19,6 +19,7 @@ from model.inference.mesh import Mesh, empty_mesh, from_trimesh, volume_ml
 from service.adapters.mesh_formats import colours, write_mesh
 from service.ports import MeshFormat
 from tests.analytic_shapes import Ellipsoid
+from tests.service_parts import tetrahedron
 
 SHAPE = Ellipsoid((7.0, 9.0, 12.0), np.array([30.0, -12.0, 5.0]))
 METADATA = {"model": "hippocampus", "version": "1.2.0", "seed": 3}
@@ -228,3 +229,10 @@ def test_unknown_formats_and_spaces_are_refused(mesh, format, space, part):
 def test_empty_mesh_is_refused(format):
     with pytest.raises(InvalidParameter):
         write_mesh(empty_mesh(), format, metadata={})
+
+
+@pytest.mark.parametrize(("values", "said"), [((0.0, 1.5, 0.5, 1.0), "0 to 1.5"), ((-2.0, 1.5, 0.5, 1.0), "-2 to 2")])
+def test_gltf_says_the_scalars_of_the_first_colour_and_the_last(values, said):
+    mesh = tetrahedron({"signed_distance_mm": np.array(values)})
+    data = write_mesh(mesh, "glb", metadata=METADATA)
+    assert f"signed_distance_mm from {said}".encode() in data
