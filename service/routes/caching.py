@@ -15,6 +15,18 @@ from service.routes.responses import Responses
 
 #: What depends on the model's digest and the query alone may be kept for ever.
 IMMUTABLE = "max-age=31536000, immutable"
+#: Description of the header of a conditional request (RFC 9110, 13.1.2). It is read as it comes, never refused.
+CONDITIONAL: dict[str, Any] = {
+    "parameters": [
+        {
+            "name": "If-None-Match",
+            "in": "header",
+            "required": False,
+            "schema": {"type": "string"},
+            "description": "tags of copies that the client holds; 304 when one of them is the answer's",
+        }
+    ]
+}
 #: Rises when the program gives another answer to the same query of the same model.
 REVISION = 2
 
@@ -39,5 +51,14 @@ def not_modified(headers: Mapping[str, str]) -> Response:
 
 def cached(answer: dict[str, Any]) -> Responses:
     """Description of an answer with these headers."""
-    tag = {"schema": {"type": "string"}, "description": "strong, of model and query"}
-    return {200: {**answer, "headers": {"ETag": tag}}, 304: {"description": "the client holds it already"}}
+    headers = {
+        "ETag": {"schema": {"type": "string"}, "description": "strong, of model and query"},
+        "Cache-Control": {
+            "schema": {"type": "string"},
+            "description": f"`{IMMUTABLE}`, and `public`, or `private` where keys are asked for",
+        },
+    }
+    return {
+        200: {**answer, "headers": headers},
+        304: {"description": "the client holds it already", "headers": headers},
+    }

@@ -10,7 +10,7 @@ from model.bundle import ShapeModel
 from service import use_cases
 from service.mode_presentation import mode_list
 from service.mode_schemas import ModeList, ModeMeshQuery, ModeQuery, ShapeQuery, parse_coordinates
-from service.routes.caching import cached, caching_headers, is_held, not_modified
+from service.routes.caching import CONDITIONAL, cached, caching_headers, is_held, not_modified
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithModel, WithServices, address
 from service.routes.meshes import model_metadata
@@ -30,6 +30,7 @@ def modes_router() -> APIRouter:
         response_model=ModeList,
         summary="Modes of shape, by what they move",
         responses={**cached({"description": "the modes by rank"}), **problems(404, 503)},
+        openapi_extra=CONDITIONAL,
     )
     for path, endpoint, summary in (
         ("/modes/{rank}", read_mode, "The surface along one mode"),
@@ -42,6 +43,7 @@ def modes_router() -> APIRouter:
             response_class=Response,
             summary=summary,
             responses={**_cached_mesh(), **problems(404, 413, 422, 503)},
+            openapi_extra=CONDITIONAL,
         )
     return router
 

@@ -60,10 +60,19 @@ def reconstructions_router() -> APIRouter:
                 "description": "the summary; the header Location says where it is kept",
                 "headers": {"Location": {"schema": {"type": "string"}, "description": "address of the result"}},
             },
-            200: files(
-                (MESH_MEDIA_TYPES[format] for format in DIRECT_FORMATS),
-                "the mesh itself, when Accept asks for one; Content-Location says where it is kept",
-            ),
+            200: {
+                **files(
+                    (MESH_MEDIA_TYPES[format] for format in DIRECT_FORMATS),
+                    "the mesh itself, when Accept asks for one; Content-Location says where it is kept",
+                ),
+                "headers": {
+                    "Content-Location": {"schema": {"type": "string"}, "description": "address of the mesh"},
+                    "Link": {
+                        "schema": {"type": "string"},
+                        "description": '`rel="describedby"`: the summary\'s address',
+                    },
+                },
+            },
             202: JOB_ACCEPTED,
             **problems(400, 406, 413, 415, 422, 503, 507),
         },

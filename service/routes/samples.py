@@ -16,7 +16,7 @@ from service import use_cases
 from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, make_sample, manifest_bytes
 from service.ports import SampleFormat, Ticket
 from service.request_schemas import BatchQuery, SampleQuery, Seed
-from service.routes.caching import cached, caching_headers, is_held, not_modified
+from service.routes.caching import CONDITIONAL, cached, caching_headers, is_held, not_modified
 from service.routes.connection import in_order, run_while_connected
 from service.routes.dependencies import Services, WithModel, WithServices, WithTicket
 from service.routes.models import PATH
@@ -44,6 +44,7 @@ def samples_router() -> APIRouter:
             **cached(files(map(sample_media_type, SampleFormat), "the shape in the model's canonical frame, mm")),
             **problems(404, 413, 422, 503),
         },
+        openapi_extra=CONDITIONAL,
     )
     return router
 

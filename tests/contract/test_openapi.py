@@ -88,3 +88,19 @@ def test_active_dimensions_say_of_which_variance_they_are(document):
     assert of_base["properties"].keys() == of_surface["properties"].keys()
     assert "base" in of_base["description"]
     assert "surface" in of_surface["description"]
+
+
+def test_headers_of_answers_and_of_conditional_requests_are_declared(document):
+    made = document["paths"]["/v1/reconstructions"]["post"]["responses"]
+    assert set(made["200"]["headers"]) == {"Content-Location", "Link"}
+    assert set(made["202"]["headers"]) == {"Location", "Preference-Applied"}
+    conditional = [found for found in operations(document) if "304" in found[2]["responses"]]
+    assert len(conditional) == 4
+    for _, _, operation in conditional:
+        assert [item["name"] for item in operation["parameters"] if item["in"] == "header"] == ["If-None-Match"]
+        for status in ("200", "304"):
+            assert set(operation["responses"][status]["headers"]) == {"ETag", "Cache-Control"}
+
+
+def test_head_is_no_operation_of_its_own(document):
+    assert not any("head" in item for item in document["paths"].values())
