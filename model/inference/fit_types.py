@@ -39,7 +39,6 @@ class FitOptions:
 
     Attributes:
         mirror: whether left and right may be exchanged.
-        any_orientation: whether half turns about the canonical axes are tried too, for drawings whose axes are unknown.
         screened: whether starts are looked for among many places of the mean shape; of drawings on one or two planes
             they always are.
         robust: whether planes that contradict all others are left out.
@@ -49,7 +48,6 @@ class FitOptions:
     """
 
     mirror: MirrorRule = "never"
-    any_orientation: bool = False
     screened: bool = False
     robust: bool = True
     position_sd_mm: float = 20.0

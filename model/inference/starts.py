@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 
 from model.bundle import ShapeModel
 from model.errors import InvalidMask
@@ -58,7 +57,7 @@ def has_few_planes(observations: Observations) -> bool:
 
 
 def starting_poses(observations: Observations, options: FitOptions) -> Sequence[Pose]:
-    """Poses at the centroid of the drawn foreground, one for each side and orientation that may be tried.
+    """Poses at the centroid of the drawn foreground, one for each side that may be tried.
 
     Raises:
         InvalidMask: no observation is foreground, as when thinning out many planes left none that holds any.
@@ -71,10 +70,7 @@ def starting_poses(observations: Observations, options: FitOptions) -> Sequence[
         )
     centre = inside @ observations.points / inside.sum()
     sides = {"never": (False,), "always": (True,), "auto": (False, True)}[options.mirror]
-    turns = [np.eye(3)]
-    if options.any_orientation:
-        turns += [Rotation.from_rotvec(np.pi * axis).as_matrix() for axis in np.eye(3)]
-    return [Pose(centre, turn, mirrored=side) for side in sides for turn in turns]
+    return [Pose(centre, mirrored=side) for side in sides]
 
 
 def _poses_beyond(model: ShapeModel, observations: Observations, poses: Sequence[Pose]) -> list[Pose]:
