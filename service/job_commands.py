@@ -103,7 +103,8 @@ def reconstruct_job(
 ) -> None:
     """Reconstruct each mask of a folder or a ZIP."""
     require_free({"--output": output}, force=force)
-    checked_labels(parse_labels(label or [])), parse_extents(extents)
+    checked_labels(parse_labels(label or []))
+    parse_extents(extents)
     settings = load_settings()
     chosen = context.obj(settings).get(model)
     require_step(chosen, resolution_mm, settings.max_voxels, part="resolution_mm")

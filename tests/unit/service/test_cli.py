@@ -126,6 +126,15 @@ def test_a_surface_of_too_many_voxels_is_refused(mask, words, capsys, monkeypatc
     assert "resolution_mm" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [(("--label", "255"), "label"), (("--annotated", '[{"stack": 1, "axis": 2, "index": 4}]'), "annotated[0]")],
+)
+def test_a_job_that_no_mask_can_be_used_for_is_refused_at_once(mask, words, part, capsys):
+    assert run("jobs", "reconstruct", mask.parent, *words) == BAD_INPUT
+    assert part in capsys.readouterr().err
+
+
 def test_a_mask_that_is_not_there_is_named_by_its_number(mask, tmp_path, capsys):
     assert run("reconstruct", mask, tmp_path / "absent.nii") == BAD_INPUT
     told = capsys.readouterr().err
