@@ -1,12 +1,12 @@
 # syntax=docker/dockerfile:1
-# The service: Python, ONNX Runtime and the models that ship; no torch, no compiler, no root.
+# The service: Python, ONNX Runtime, the models that ship, object storage and DICOM; no torch, no compiler, no root.
 #   docker build --file docker/service.Dockerfile --tag morphoflow .
 FROM python:3.11-slim-bookworm AS build
 
 ENV PIP_NO_CACHE_DIR=1 PYTHONDONTWRITEBYTECODE=1
 WORKDIR /src
 COPY . .
-RUN docker/install.sh /opt/morphoflow cluster
+RUN docker/install.sh /opt/morphoflow cluster pacs
 
 
 FROM python:3.11-slim-bookworm AS service
@@ -33,7 +33,7 @@ ENV PATH=/opt/morphoflow/bin:$PATH \
 USER 10001:10001
 WORKDIR /data
 VOLUME ["/data"]
-EXPOSE 8080
+EXPOSE 8080 11112
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=10s --timeout=3s --start-period=30s --retries=3 \
     CMD ["python", "-c", "import os, urllib.request as r; r.urlopen(f'http://127.0.0.1:{os.environ[\"MORPHOFLOW_PORT\"]}/readyz', timeout=2)"]

@@ -15,7 +15,14 @@ from typing import Any
 import pytest
 import yaml
 
+from service.adapters.pacs.configuration import Listener
+from service.settings import Settings
+
 DOCKERFILES = ("service.Dockerfile", "training.Dockerfile")
+#: Extras of the service image: it keeps results in a bucket and stands beside an archive where it is told to.
+EXTRAS = ("cluster", "pacs")
+#: Port of the listener for DICOM.
+DIMSE = Listener.model_fields["port"].default
 
 
 def tool(name: str, *arguments: str | Path) -> CompletedProcess[str]:
@@ -66,10 +73,9 @@ def test_linter_would_object(tmp_path: Path) -> None:
     assert tool("hadolint", bad).returncode != 0
 
 
-def test_compose_file_follows_the_specification(repository: Path) -> None:
-    checked = tool(
-        "check-jsonschema", "--builtin-schema", "vendor.compose-spec", repository / "docker" / "compose.yaml"
-    )
+@pytest.mark.parametrize("name", ["compose.yaml", "compose.pacs.yaml"])
+def test_compose_file_follows_the_specification(name: str, repository: Path) -> None:
+    checked = tool("check-jsonschema", "--builtin-schema", "vendor.compose-spec", repository / "docker" / name)
     assert checked.returncode == 0, checked.stdout
 
 
@@ -97,6 +103,60 @@ def test_writable_places_of_the_image_are_volumes(repository: Path, compose: dic
     assert results
     assert any(Path(results[1]).is_relative_to(volume) for volume in volumes)
     assert {mount.split(":")[1] for mount in compose["services"]["service"]["volumes"]} == set(volumes)
+
+
+def test_compose_beside_an_archive_adds_a_port_and_a_folder_that_is_only_read(repository: Path) -> None:
+    overlay = yaml.safe_load((repository / "docker" / "compose.pacs.yaml").read_text())["services"]
+    assert set(overlay) == {"service"}
+    service = overlay["service"]
+    ((name, file),) = service["environment"].items()
+    assert name.removeprefix("MORPHOFLOW_").lower() in Settings.model_fields
+    (mount,) = service["volumes"]
+    assert mount.endswith(f":{Path(file).parent}:ro")
+    (port,) = service["ports"]
+    assert port.startswith("${PACS_ADDRESS:-127.0.0.1}:")
+    assert port.endswith(f":{DIMSE}")
+    assert str(DIMSE) in " ".join(instructions(repository / "docker" / "service.Dockerfile", "EXPOSE"))
+
+
+def test_kubernetes_beside_an_archive_patches_what_is_there(repository: Path) -> None:
+    folder, base = repository / "docker" / "kubernetes-pacs", repository / "docker" / "kubernetes"
+    listed = yaml.safe_load((folder / "kustomization.yaml").read_text())
+    added = [folder / name for name in listed["resources"] if name != "../kubernetes"]
+    patches = [folder / patch["path"] for patch in listed["patches"]]
+    assert {*added, *patches, folder / "kustomization.yaml"} == set(folder.iterdir())
+    checked = tool("kubernetes-validate", "--strict", *added)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    known = {key for path in base.glob("*.yaml") if path.name != "kustomization.yaml" for key in objects(path)}
+    assert {key for path in patches for key in objects(path)} <= known
+    (file,) = objects(folder / "configuration.yaml")["ConfigMap", "morphoflow"]["data"].values()
+    for kind, name in (("Deployment", "service"), ("StatefulSet", "worker")):
+        pod = objects(folder / f"{'service' if name == 'service' else 'workers'}.yaml")[kind, name]["spec"]["template"]
+        mounts = {mount["name"]: mount for mount in pod["spec"]["containers"][0]["volumeMounts"]}
+        assert set(mounts) == {volume["name"] for volume in pod["spec"]["volumes"]}
+        assert mounts["pacs"] == {"name": "pacs", "mountPath": str(Path(file).parent), "readOnly": True}
+    policy = objects(folder / "archive.yaml")["NetworkPolicy", "from-archive"]["spec"]["ingress"][0]
+    assert DIMSE in [entry["port"] for entry in policy["ports"]]
+
+
+def objects(path: Path) -> dict[tuple[str, str], Any]:
+    """Objects of a file for Kubernetes by kind and name."""
+    found = yaml.safe_load_all(path.read_text())
+    return {(item["kind"], item["metadata"]["name"]): item for item in found}
+
+
+@pytest.mark.skipif(shutil.which("kubectl") is None, reason="needs kubectl")
+def test_kustomize_puts_both_together(repository: Path, tmp_path: Path) -> None:
+    command = ["kubectl", "kustomize", repository / "docker" / "kubernetes-pacs"]
+    made = run(command, capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stderr
+    (tmp_path / "all.yaml").write_text(made.stdout)
+    checked = tool("kubernetes-validate", "--strict", tmp_path / "all.yaml")
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    whole = objects(tmp_path / "all.yaml")
+    pod = whole["Deployment", "service"]["spec"]["template"]["spec"]
+    assert {"tmp", "data", "pacs", "audit"} == {volume["name"] for volume in pod["volumes"]}
+    assert {"http", "dimse"} == {port["name"] for port in pod["containers"][0]["ports"]}
 
 
 class Readiness(BaseHTTPRequestHandler):
@@ -140,7 +200,7 @@ def installation(build_context: Path, tmp_path_factory: pytest.TempPathFactory) 
     target = tmp_path_factory.mktemp("image") / "opt"
     environment = {**os.environ, "PYTHON": sys.executable}
     script = build_context / "docker" / "install.sh"
-    command = [script, target, "cluster"]
+    command = [script, target, *EXTRAS]
     done = run(command, cwd=build_context, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return target / "bin"
@@ -148,7 +208,7 @@ def installation(build_context: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 def test_image_installs_with_that_script(repository: Path) -> None:
     image = (repository / "docker" / "service.Dockerfile").read_text()
-    assert "RUN docker/install.sh /opt/morphoflow cluster\n" in image
+    assert f"RUN docker/install.sh /opt/morphoflow {' '.join(EXTRAS)}\n" in image
 
 
 @pytest.mark.slow
@@ -187,6 +247,11 @@ class TestInstalledService:
         made = self.command(installation, tmp_path, *command)
         assert made.returncode == 0, made.stderr
         assert target.stat().st_size > 0
+
+    def test_the_archives_side_can_be_loaded(self, installation: Path, tmp_path: Path) -> None:
+        words = (installation / "python", "-c", "import service.pacs, service.jobs.pacs, service.adapters.s3")
+        loaded = self.command(installation, tmp_path, *words)
+        assert loaded.returncode == 0, loaded.stderr
 
     def test_environment_agrees_with_itself(self, installation: Path, tmp_path: Path) -> None:
         checked = self.command(installation, tmp_path, installation / "pip", "check")
