@@ -19,6 +19,7 @@ from service.adapters.mesh_formats import write_mesh
 from service.adapters.per_model import PerModel
 from service.adapters.processes import compute_here
 from service.adapters.workers import WorkerPool
+from service.extras import require_extra
 from service.model_registry import ModelRegistry, load_registry
 from service.observability import Log, Metrics, make_log
 from service.ports import Compute, MaskReader
@@ -109,7 +110,8 @@ def _open_pacs(services: Services) -> AbstractContextManager[object]:
     """What stands among picture archives while the service runs; nothing where no file is set."""
     if services.settings.pacs_file is None:
         return nullcontext()
-    from service.pacs import open_pacs  # the extra pacs is needed only here
+    require_extra("pacs", needed_by="MORPHOFLOW_PACS_FILE")
+    from service.pacs import open_pacs
 
     pacs = open_pacs(services.settings, services.settings.pacs_file, services.blobs, services.jobs, services.log)
     services.metrics.watch("morphoflow_dicom_backlog", "Accepted drawings not given back yet", pacs.inbox.backlog)

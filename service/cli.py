@@ -19,7 +19,9 @@ from model.errors import CohortError, InputError, MorphoFlowError, NotFound
 from service.adapters.processes import spread
 from service.app import create_app, interface_document, program_version
 from service.commands import OpenRegistry, models, reconstruct, sample
+from service.console import writing
 from service.dicom_commands import audit, deidentify
+from service.extras import install_line, require_extras
 from service.job_commands import jobs_commands
 from service.jobs.worker import run_worker, supervised_workers
 from service.mode_commands import modes
@@ -89,8 +91,8 @@ def load_plugins(app: typer.Typer, entries: Iterable[EntryPoint]) -> list[str]:
             entry.load()(app)
         except ImportError as error:
             library = (error.name or "a library").split(".")[0]
-            extra = f"{PROGRAM}[{entry.name}]"
-            sentences.append(f"The commands of {entry.name} need {library}; install them with: pip install '{extra}'.")
+            line = install_line(entry.name)
+            sentences.append(f"The commands of {entry.name} need {library}; install them with: {line}")
     return sentences
 
 
@@ -109,6 +111,7 @@ def serve(
     given: dict[str, Any] = {"host": host, "port": port}
     settings = load_settings({name: value for name, value in given.items() if value is not None})
     require_protection(settings)
+    require_extras(settings)
     registry = context.obj(settings)
     helping = settings.model_copy(update={"threads": settings.threads or 1})
     example = example_request(settings, registry.names())
@@ -137,6 +140,7 @@ def worker(
 ) -> None:
     """Do jobs until told to stop."""
     settings = load_settings()
+    require_extras(settings)
     settings = settings.model_copy(update={"threads": settings.threads or 1})
     run_worker(settings, context.obj(settings), slot, attached=attached)
 
@@ -149,7 +153,8 @@ def openapi(
     if output is None:
         typer.echo(text, nl=False)
     else:
-        output.write_text(text, encoding="utf-8")
+        with writing("--output"):
+            output.write_text(text, encoding="utf-8")
 
 
 def interface_yaml() -> str:

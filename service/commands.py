@@ -24,7 +24,7 @@ from service.adapters.mesh_formats import write_mesh
 from service.adapters.processes import spread
 from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, make_sample, manifest_bytes
 from service.app import mask_reader
-from service.console import echo_json, in_order, progress, require_free, require_suffix
+from service.console import echo_json, in_order, progress, require_free, require_suffix, writing
 from service.model_registry import ModelRegistry, load_registry
 from service.ports import Compute, MeshFormat, Outcome, SampleFormat
 from service.presentation import model_summary, summary_of
@@ -91,9 +91,12 @@ def reconstruct(
         watch("masks")
         stacks = _read(settings, masks, parse_labels(label or []))
         outcome = use_cases.reconstruct(registry.get(model), stacks, options, settings.max_voxels, watch)
-        _write_mesh(outcome, output, format, max_error_mm)
-        _write_volume(registry, outcome, segmentation, use_cases.segmentation, settings.max_voxels)
-        _write_volume(registry, outcome, entropy, use_cases.entropy_map, settings.max_voxels)
+        with writing("--output"):
+            _write_mesh(outcome, output, format, max_error_mm)
+        with writing("--segmentation"):
+            _write_volume(registry, outcome, segmentation, use_cases.segmentation, settings.max_voxels)
+        with writing("--entropy"):
+            _write_volume(registry, outcome, entropy, use_cases.entropy_map, settings.max_voxels)
     summary = summary_of(outcome)
     echo_json(summary) if as_json else typer.echo(_sentences(summary))
 
@@ -117,7 +120,7 @@ def sample(
     seeds = use_cases.batch_seeds(seed, count, use_cases.MAX_SEED)
     how = Draw(format, temperature, spacing_mm, settings.max_voxels, reject)
     helpers = min(settings.workers - 1, count // SHAPES_FOR_HELPER)
-    with spread(helpers, partial(load_registry, settings)) as compute:
+    with spread(helpers, partial(load_registry, settings)) as compute, writing("--output"):
         batch = _Batch(chosen, seeds, how, compute, helpers + 1)
         if output.suffix.lower() == ".zip":
             require_free({"--output": output}, force=force)

@@ -1,5 +1,6 @@
 """What commands share: progress on a terminal, files that are not overwritten, output for machines."""
 
+import os
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -73,6 +74,20 @@ def require_free(paths: dict[str, Path | None], *, force: bool) -> None:
             raise InvalidParameter(f"{option} must name a file in a folder that exists.", part=option)
         if path.exists() and not force:
             raise InvalidParameter(f"{option} names a file that exists; --force overwrites it.", part=option)
+
+
+@contextmanager
+def writing(option: str) -> Iterator[None]:
+    """What cannot be written is the caller's to mend.
+
+    Raises:
+        InvalidParameter: names the option and the system's reason.
+    """
+    try:
+        yield
+    except OSError as fault:
+        reason = os.strerror(fault.errno) if fault.errno else "the system refuses it"
+        raise InvalidParameter(f"{option} cannot be written: {reason}.", part=option) from fault
 
 
 def require_suffix(option: str, path: Path | None, suffixes: tuple[str, ...]) -> str:

@@ -8,6 +8,8 @@ import typer
 from model.errors import InvalidParameter
 from service.adapters.image_guard import ImageLimits
 from service.adapters.nifti import write_nifti
+from service.console import writing
+from service.extras import require_extra
 from service.settings import load_settings
 
 
@@ -16,7 +18,8 @@ def deidentify(
     output: Annotated[Path, typer.Option(help="Folder to write; it must be empty or not there.")],
 ) -> None:
     """Turn a study into training data: objects without identifiers, and drawings as label maps."""
-    from service.adapters.dicom import deidentification  # the extra pacs is needed only here
+    require_extra("pacs", needed_by="morphoflow deidentify")
+    from service.adapters.dicom import deidentification
 
     if not study.is_dir():
         raise InvalidParameter("The study must be a folder with DICOM files.", part="study")
@@ -28,14 +31,15 @@ def deidentify(
     if not objects:
         raise InvalidParameter("The study holds no DICOM file; files with the DICOM prefix are accepted.", part="study")
     maps = list(deidentification.label_maps(objects, limits))
-    for folder in (output / "dicom", output / "masks"):
-        folder.mkdir(parents=True)
-    for number, found in enumerate(objects):
-        path = output / "dicom" / f"{number:06d}.dcm"
-        deidentification.without_identifiers(found).save_as(path, enforce_file_format=True)
-    for number, drawn in enumerate(maps):
-        data = write_nifti(drawn.values, drawn.grid, "drawing")
-        (output / "masks" / f"{number:06d}.nii.gz").write_bytes(data)
+    with writing("--output"):
+        for folder in (output / "dicom", output / "masks"):
+            folder.mkdir(parents=True)
+        for number, found in enumerate(objects):
+            path = output / "dicom" / f"{number:06d}.dcm"
+            deidentification.without_identifiers(found).save_as(path, enforce_file_format=True)
+        for number, drawn in enumerate(maps):
+            data = write_nifti(drawn.values, drawn.grid, "drawing")
+            (output / "masks" / f"{number:06d}.nii.gz").write_bytes(data)
     typer.echo(f"{len(objects)} objects without identifiers, {len(maps)} drawings as label maps.")
 
 

@@ -7,6 +7,7 @@ from service.adapters.blob_results import BlobResultStore
 from service.adapters.blobs import FolderBlobs
 from service.adapters.jobs.client import DbosJobs
 from service.adapters.result_store import DiskResultStore
+from service.extras import require_extra
 from service.job_ports import BlobStore
 from service.settings import Settings
 
@@ -25,7 +26,8 @@ def open_jobs(settings: Settings) -> DbosJobs:
 def open_blobs(settings: Settings) -> BlobStore:
     """Files of jobs: a bucket where one is set, else a folder beside the results."""
     if settings.storage_url:
-        from service.adapters.s3 import S3Blobs  # boto3 comes with the extra cluster
+        require_extra("cluster", needed_by="MORPHOFLOW_STORAGE_URL")
+        from service.adapters.s3 import S3Blobs
 
         return S3Blobs(settings.storage_url, settings.storage_endpoint or None)
     return FolderBlobs(settings.results_folder.absolute().parent / "files")
