@@ -21,7 +21,7 @@ AT = "@"
 
 @dataclass(frozen=True)
 class BrokenModel:
-    """A bundle that could not be opened: its folder's last name, and why."""
+    """A bundle that could not be opened, or a folder of bundles that is not there: its last name, and why."""
 
     name: str
     reason: str
@@ -111,7 +111,8 @@ def load_registry(settings: Settings) -> ModelRegistry:
     once = OpenedOnce(lambda folder: open_bundle(folder, backend=settings.backend, threads=settings.threads))
 
     def load() -> ModelRegistry:
-        return load_models([bundle for root in (*shipped, *settings.models) for bundle in find_bundles(root)], once)
+        found = load_models([bundle for root in (*shipped, *settings.models) for bundle in find_bundles(root)], once)
+        return ModelRegistry(found._models, (*found.broken, *absent_folders(settings.models)))
 
     found = load()
     return ModelRegistry(found._models, found.broken, load)
@@ -139,6 +140,13 @@ def find_bundles(root: Path) -> Iterator[Path]:
         yield root
     elif root.is_dir():
         yield from sorted(folder for folder in root.iterdir() if folder.is_dir() and not folder.name.startswith("."))
+
+
+def absent_folders(roots: Iterable[Path]) -> Iterator[BrokenModel]:
+    """What stands for the folders that are named and not there, or no folders."""
+    for root in roots:
+        if not root.is_dir():
+            yield BrokenModel(root.name, "MORPHOFLOW_MODELS names this folder, and there is none of this name.")
 
 
 def _newest(models: Iterable[ShapeModel]) -> dict[str, ShapeModel]:

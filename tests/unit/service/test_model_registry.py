@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 
 from model.errors import BundleCorrupt, BundleIncomplete, InvalidParameter, UnknownModel
-from service.model_registry import MANIFEST, ModelRegistry, OpenedOnce, find_bundles, load_models
+from service.model_registry import MANIFEST, ModelRegistry, OpenedOnce, find_bundles, load_models, load_registry
+from service.settings import Settings
 from tests.analytic_model import ellipsoid_model
 
 
@@ -63,6 +64,18 @@ def test_a_folder_is_a_bundle_or_holds_bundles(tmp_path):
     assert [folder.name for folder in find_bundles(tmp_path)] == ["a", "b", "half"]
     assert list(find_bundles(tmp_path / "a")) == [tmp_path / "a"]
     assert list(find_bundles(tmp_path / "nowhere")) == []
+
+
+def test_a_folder_that_is_not_there_is_told_of_without_its_path_until_it_comes(tmp_path):
+    root = tmp_path / "secret" / "typo"
+    registry = load_registry(Settings(models=(root,), shipped_models=False))
+    (absent,) = registry.broken
+    assert absent.name == "typo"
+    assert "MORPHOFLOW_MODELS" in absent.reason
+    assert "secret" not in absent.reason
+    root.mkdir(parents=True)
+    assert registry.refresh()
+    assert registry.broken == ()
 
 
 def test_a_folder_without_a_manifest_counts_as_broken(tmp_path):
