@@ -102,7 +102,18 @@ def test_writable_places_of_the_image_are_volumes(repository: Path, compose: dic
     results = re.search(r"MORPHOFLOW_RESULTS_FOLDER=(\S+)", environment)
     assert results
     assert any(Path(results[1]).is_relative_to(volume) for volume in volumes)
-    assert {mount.split(":")[1] for mount in compose["services"]["service"]["volumes"]} == set(volumes)
+    mounts = compose["services"]["service"]["volumes"]
+    assert {mount.rpartition(":")[2] for mount in mounts if not mount.endswith(":ro")} == set(volumes)
+
+
+def test_further_models_are_read_from_a_folder_of_this_machine(compose: dict[str, Any]) -> None:
+    service = compose["services"]["service"]
+    assert f"${{MODELS:-../models}}:{service['environment']['MORPHOFLOW_MODELS']}:ro" in service["volumes"]
+
+
+def test_training_data_lie_where_the_dockerfile_says(repository: Path, compose: dict[str, Any]) -> None:
+    assert '--volume "$PWD/data:/data:ro"' in (repository / "docker" / "training.Dockerfile").read_text()
+    assert "${DATA:-../data}:/data:ro" in compose["services"]["training"]["volumes"]
 
 
 def test_compose_beside_an_archive_adds_a_port_and_a_folder_that_is_only_read(repository: Path) -> None:
