@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +19,7 @@ from model.backends import (
     onnx_completer,
     torchscript_completer,
 )
-from model.errors import BundleCorrupt, BundleIncomplete, BundleTooNew
+from model.errors import BundleCorrupt, BundleIncomplete, BundleTooNew, InvalidParameter
 from model.geometry import CanonicalLattice
 
 BackendName = Literal["onnx", "torchscript"]
@@ -26,6 +27,10 @@ BackendName = Literal["onnx", "torchscript"]
 FORMAT = 1
 MANIFEST = "manifest.json"
 POPULATION = "population.npz"
+#: Names and versions of models: they stand in addresses, in names of files, and on either side of an ``@``.
+PLAIN_NAME = re.compile(r"[a-z0-9][a-z0-9._-]*")
+#: What such a name is made of, in words.
+PLAIN_WORDS = "small letters, digits, '.', '_' and '-', with a letter or a digit first"
 #: Files without which there is nothing to run.
 REQUIRED_FILES = (
     POPULATION,
@@ -184,8 +189,29 @@ def read_manifest(folder: Path) -> tuple[Manifest, str]:
     return _manifest_of(values), hashlib.sha256(data).hexdigest()
 
 
+def check_names(name: str | None, version: str) -> None:
+    """Refuse names and versions of models that no address could hold.
+
+    Raises:
+        InvalidParameter: says of which letters they may be.
+    """
+    for part, text in (("name", name), ("version", version)):
+        if text is not None and not PLAIN_NAME.fullmatch(text):
+            raise InvalidParameter(f"The {part} of a model must be of {PLAIN_WORDS}.", part=part)
+
+
+def plain_name(text: str) -> str:
+    """A model's name that is like a text: small letters, and hyphens in place of what a name cannot hold."""
+    return re.sub(r"[^a-z0-9._-]+", "-", text.lower()).strip("._-") or "model"
+
+
 def write_manifest(manifest: Manifest, folder: Path) -> None:
-    """Write ``manifest.json``; inverse of `read_manifest`."""
+    """Write ``manifest.json``; inverse of `read_manifest`.
+
+    Raises:
+        InvalidParameter: see `check_names`.
+    """
+    check_names(manifest.name, manifest.version)
     values = {"format": FORMAT, **{f.name: getattr(manifest, f.name) for f in fields(Manifest)}}
     (folder / MANIFEST).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
 
@@ -197,6 +223,8 @@ def _manifest_of(values: dict[str, Any]) -> Manifest:
     if missing:
         raise BundleCorrupt(f"{MANIFEST} lacks {', '.join(missing)}; one written by morphoflow export is accepted.")
     values = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items() if name in known}
+    if not all(isinstance(values[part], str) and PLAIN_NAME.fullmatch(values[part]) for part in ("name", "version")):
+        raise BundleCorrupt(f"{MANIFEST} has a name or a version that is not of {PLAIN_WORDS}; export the model anew.")
     files = values["files"]
     if not isinstance(files, dict) or not all(_is_plain(name) for name in files):
         raise BundleCorrupt(f"{MANIFEST} lists files outside the bundle; names of files beside it are accepted.")

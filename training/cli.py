@@ -152,9 +152,11 @@ def export(
 ) -> None:
     """Export a run as a bundle that the service loads."""
     with exit_status():
+        from model.bundle import check_names
         from training.pruning import PriorParts
         from training.release import export_run, wants_prior
 
+        check_names(name, version)
         stood_still = wants_prior(run)
         fitted = stood_still if prune is None else prune
         parts = PriorParts(least_movement=least_movement, least_of_training=training_share)

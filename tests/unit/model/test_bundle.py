@@ -6,8 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.bundle import FORMAT, MANIFEST, POPULATION, REQUIRED_FILES, open_bundle, read_manifest, write_manifest
-from model.errors import BundleCorrupt, BundleError, BundleIncomplete, BundleTooNew
+from model.bundle import (
+    FORMAT,
+    MANIFEST,
+    POPULATION,
+    REQUIRED_FILES,
+    open_bundle,
+    plain_name,
+    read_manifest,
+    write_manifest,
+)
+from model.errors import BundleCorrupt, BundleError, BundleIncomplete, BundleTooNew, InvalidParameter
 from tests.random_networks import DECODER, manifest_of
 
 pytestmark = [
@@ -64,6 +73,26 @@ def test_writing_undoes_reading(bundle, tmp_path):
     write_manifest(manifest, tmp_path)
     assert read_manifest(tmp_path) == (manifest, digest)
     assert manifest == manifest_of(bundle, list(manifest.files))
+
+
+@pytest.mark.parametrize("part", ["name", "version"])
+@pytest.mark.parametrize("text", ["My Bone", "a/b@c", "", ".hidden", "bone\n", "Knochen", "öl"])
+def test_a_name_that_no_address_could_hold_is_refused(bundle, part, text):
+    edit(bundle, **{part: text})
+    with pytest.raises(BundleCorrupt, match="small letters"):
+        read_manifest(bundle)
+    edit(bundle, **{part: "bone-2.1_a"})
+    manifest, _ = read_manifest(bundle)
+    with pytest.raises(InvalidParameter, match=f"The {part} .* small letters") as caught:
+        write_manifest(replace(manifest, **{part: text}), bundle)
+    assert caught.value.part == part
+
+
+@pytest.mark.parametrize(
+    ("text", "name"), [("hippocampus", "hippocampus"), ("My Bones (2)", "my-bones-2"), (" ", "model")]
+)
+def test_a_folder_gives_its_name_to_a_model_as_far_as_it_can(text, name):
+    assert plain_name(text) == name
 
 
 def test_a_later_format_is_refused(bundle):
