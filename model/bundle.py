@@ -78,6 +78,8 @@ class Manifest:
         completion: of a network that completes drawings (`model.inference.completion`): ``voxels`` and ``step_mm`` of
             its lattice, ``share`` of its distances beside those of the fitted surface, chosen on validation shapes,
             and ``training``; empty without one.
+        training_masks: digests of the training masks' voxels (`training.seen`), by which no shape of the training is
+            taken for a held-out one; empty where they are not known.
         anatomy: code of the structure, by default none: ``value``, ``scheme`` (``SCT`` for SNOMED CT) and ``meaning``.
     """
 
@@ -105,6 +107,7 @@ class Manifest:
     posterior: dict[str, float] = field(default_factory=dict)
     typical: dict[str, float] = field(default_factory=dict)
     completion: dict[str, Any] = field(default_factory=dict)
+    training_masks: tuple[str, ...] = field(default_factory=tuple)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from model.networks.decoder import OccupancyDecoder
 from model.networks.prior import LatentPrior
 from training.config import TrainingConfig
+from training.interruption import Interruption
 from training.objective import gaussian_entropy, reconstruction_loss
 from training.recorded import RecordedStep
 from training.samples import Batch, PointPool, ShapePoints
@@ -215,12 +216,18 @@ def _optimiser(module: AutoDecoder, config: TrainingConfig) -> torch.optim.Optim
 
 
 def train(trainer: Trainer, folder: Path, watch: Watch = lambda step, figures: None) -> AutoDecoder:
-    """Run to the configured number of steps with checkpoints in ``folder/checkpoint.pt``."""
+    """Run to the configured number of steps with checkpoints in ``folder/checkpoint.pt``.
+
+    Raises:
+        Stopped: interrupted from the keyboard; the checkpoint holds every step that was made.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    while not trainer.at_end():
-        following = trainer.step + 1
-        figures = trainer.advance(read=following % READ_EVERY == 0 or following == trainer.config.steps)
-        watch(trainer.step, figures)
-        if trainer.at_end() or trainer.step % trainer.config.checkpoint_every == 0:
-            trainer.save(folder / "checkpoint.pt")
+    with Interruption() as interruption:
+        while not trainer.at_end():
+            following = trainer.step + 1
+            figures = trainer.advance(read=following % READ_EVERY == 0 or following == trainer.config.steps)
+            watch(trainer.step, figures)
+            if interruption.came or trainer.at_end() or trainer.step % trainer.config.checkpoint_every == 0:
+                trainer.save(folder / "checkpoint.pt")
+            interruption.stop_at(trainer.step, trainer.config.steps)
     return trainer.module

@@ -36,6 +36,7 @@ from training.cohorts.cohort import Case, Cohort
 from training.config import Regime
 from training.evaluate import surface_distance
 from training.posterior_scale import posterior_scale
+from training.seen import check_unseen
 from training.sparsify import Drawing, for_evaluation
 from training.usual import sound_answers, typical_figures, usual_figures
 
@@ -118,8 +119,10 @@ def calibrate_bundle(
 
     Raises:
         BundleError: the bundle cannot be trusted.
+        InvalidParameter: the model was trained on one of the cases.
     """
     model = uncalibrated_share(open_bundle(folder, threads=threads))
+    check_unseen(model.manifest, cohort.validation)
     found = calibrate(model, cohort.validation, watch)
     facts: dict[str, object] = {
         "cohort": cohort.name,

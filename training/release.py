@@ -1,6 +1,6 @@
 """A finished run as a bundle: graphs, statistics of the training codes, and a manifest."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from model.bundle import POPULATION, Manifest, Population, ShapeModel, file_digest, plain_name, write_manifest
+from model.bundle import POPULATION, Manifest, Population, ShapeModel, file_digest, write_manifest
 from model.errors import InvalidParameter
 from model.networks.decoder import OccupancyDecoder
 from model.networks.export import export_graphs, quiet_exporter, torch_networks
@@ -25,6 +25,10 @@ VARIANCE_SHARES = (0.95, 0.97, 0.99)
 UNCALIBRATED_PRECISION = 0.1
 #: Grid step of the surface (mm) unless the caller asks otherwise.
 RESOLUTION_MM = 1.0
+#: Of an export, in words.
+STAGES = ("fitting the prior", "writing the graphs", "writing the population")
+
+Watch = Callable[[str], None]
 
 
 def export_run(
@@ -38,10 +42,12 @@ def export_run(
     parts: PriorParts | None = None,
     anatomy: Mapping[str, str] | None = None,
     resolution_mm: float = RESOLUTION_MM,
+    watch: Watch = lambda words: None,
 ) -> Manifest:
     """Write the bundle of a finished run: as it was trained, or with these parts of a prior fitted to its codes.
 
-    `anatomy` is the code that results in DICOM carry (`model.bundle.Manifest.anatomy`).
+    `anatomy` is the code that results in DICOM carry (`model.bundle.Manifest.anatomy`). `watch` is told each of the
+    `STAGES` as it begins.
 
     Raises:
         InvalidParameter: the folder holds no finished run, or the output holds something already.
@@ -49,14 +55,17 @@ def export_run(
     """
     if output.exists() and any(output.iterdir()):
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
+    watch(STAGES[0])
     found = assembled(run, parts)
+    watch(STAGES[1])
     output.mkdir(parents=True, exist_ok=True)
     with quiet_exporter():
         files = export_graphs(found.decoder, found.prior, output)
+    watch(STAGES[2])
     np.savez(output / POPULATION, **asdict(found.population()))
     manifest = replace(
         found.manifest(),
-        name=plain_name(found.record["cohort"]) if name is None else name,
+        name=name or found.record["cohort"],
         version=version,
         resolution_mm=resolution_mm,
         likelihood_precision=likelihood_precision,
@@ -119,6 +128,7 @@ class Assembled:
             attribution=record["attribution"],
             accuracy={},
             files={},
+            training_masks=tuple(sorted(record.get("voxels", ()))),
         )
 
     def population(self) -> Population:

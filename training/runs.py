@@ -15,7 +15,9 @@ from model.errors import InvalidParameter
 from training.autodecoder import AutoDecoder, Trainer, is_ended, train
 from training.cohorts.cohort import Case, Cohort
 from training.config import TrainingConfig, config_from_dict
+from training.difference import first_difference
 from training.points import cohort_points, decoder_extent
+from training.seen import short_digest
 from training.stopping import EarlyStopping
 from training.validation import Validation
 
@@ -52,12 +54,14 @@ def prepare(cohort: Cohort, config: TrainingConfig, folder: Path, *, resume: boo
     Raises:
         InvalidParameter: the folder holds a run and `resume` is off, or its run was made of something else.
     """
+    if not resume:
+        check_free(folder)
     shapes = cohort_points(cohort.train, config.regime, config.seed, torch.get_num_threads())
     if config.reflected:
         shapes += [shape.reflected() for shape in shapes]
     config = replace(config, decoder=replace(config.decoder, extent_mm=decoder_extent(shapes)))
     checkpoint = folder / CHECKPOINT
-    _check_folder(folder, record(cohort, config), resume=resume)
+    _check_same(folder, record(cohort, config))
     trainer = Trainer.start(config, shapes)
     if resume and checkpoint.is_file():
         trainer.load(checkpoint)
@@ -89,7 +93,7 @@ def is_finished(folder: Path, cohort: Cohort, config: TrainingConfig) -> bool:
     there, values = read_record(folder)
     decoder = replace(config.decoder, extent_mm=there.decoder.extent_mm)
     wanted = record(cohort, replace(config, decoder=decoder, device=there.device))
-    if not _is_of(values, there, wanted):
+    if _difference(values, there, wanted):
         return False
     state = torch.load(folder / CHECKPOINT, map_location="cpu", weights_only=True, mmap=True)
     return is_ended(state, there)
@@ -107,6 +111,7 @@ def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
         "attribution": cohort.attribution,
         "shippable": cohort.provenance.shippable,
         "train": {case.name: mask_digest(case) for case in cohort.train},
+        "voxels": [short_digest(case) for case in cohort.train],
         "codes": copies * len(cohort.train),
         "volumes_ml": copies * [float(case.mask.sum() * np.prod(case.grid.spacing) / 1000.0) for case in cohort.train],
         "half_extent_mm": half_extent(cohort),
@@ -145,25 +150,34 @@ def mask_digest(case: Case) -> str:
     return hashlib.sha256(head + case.mask.tobytes()).hexdigest()
 
 
-def _check_folder(folder: Path, wanted: dict[str, Any], *, resume: bool) -> None:
-    if not (folder / RECORD).is_file():
-        return
-    if not resume:
+def check_free(folder: Path) -> None:
+    """Refuse to write over a run.
+
+    Raises:
+        InvalidParameter: the folder holds one.
+    """
+    if (folder / RECORD).is_file():
         raise InvalidParameter(
             "The output folder holds a run already; an empty folder, or --resume, is accepted.", part="output"
         )
+
+
+def _check_same(folder: Path, wanted: dict[str, Any]) -> None:
+    if not (folder / RECORD).is_file():
+        return
     config, there = read_record(folder)
-    if not _is_of(there, config, wanted):
+    found = _difference(there, config, wanted)
+    if found:
         raise InvalidParameter(
-            "The run in the output folder was made of other masks or settings; the same ones are accepted.",
+            f"The run in the output folder was made of other masks or settings ({found}); the same ones are accepted.",
             part="resume",
         )
 
 
-def _is_of(values: dict[str, Any], config: TrainingConfig, wanted: dict[str, Any]) -> bool:
-    """Whether a record that was read is the one that is wanted; fields that were not there yet have their defaults."""
-    known = {**values, "config": json.loads(json.dumps(config.as_dict()))}
-    return bool(known == json.loads(json.dumps(wanted)))
+def _difference(values: dict[str, Any], config: TrainingConfig, wanted: dict[str, Any]) -> str:
+    """In what a record that was read differs from the one that is wanted; fields not there yet have their defaults."""
+    known = {"voxels": wanted["voxels"], **values, "config": json.loads(json.dumps(config.as_dict()))}
+    return first_difference(known, json.loads(json.dumps(wanted)))
 
 
 def _validating_watch(

@@ -111,15 +111,20 @@ def copies(cases: Sequence[Case]) -> tuple[Refusal, ...]:
     The one that stays is of the test split if any is, then of validation, so that no measured shape is trained on.
     """
     order = {"test": 0, "validation": 1, "train": 2}
-    kept: dict[bytes, str] = {}
+    kept: dict[str, str] = {}
     refused = []
     for case in sorted(cases, key=lambda case: order[case.split]):
-        cropped = case.mask[bounding_box(case.mask)]
-        key = hashlib.sha256(repr(cropped.shape).encode() + np.packbits(cropped).tobytes()).digest()
+        key = voxel_digest(case.mask)
         if key in kept:
             refused.append(Refusal(case.name, f"it is the same mask as {kept[key]}, which is kept", stops=False))
         kept.setdefault(key, case.name)
     return tuple(refused)
+
+
+def voxel_digest(mask: Bool[np.ndarray, "i j k"]) -> str:
+    """SHA-256 over the object's voxels, wherever it lies; the mask must not be empty."""
+    cropped = mask[bounding_box(mask)]
+    return hashlib.sha256(repr(cropped.shape).encode() + np.packbits(cropped).tobytes()).hexdigest()
 
 
 def outliers(cases: Sequence[Case]) -> tuple[Refusal, ...]:

@@ -13,6 +13,7 @@ from training.completion.samples import lattice_for, windows_of
 from training.completion.trainer import CompletionConfig, Watch, train_completion
 from training.points import Window
 from training.runs import mask_digest
+from training.seen import check_seen
 
 #: Voxels of the lattice at most, and its least step (mm).
 MOST_VOXELS, LEAST_STEP_MM = 110_000, 1.0
@@ -52,10 +53,12 @@ def complete_bundle(
 
     Raises:
         BundleError: the bundle cannot be trusted.
-        InvalidParameter: the folder holds a training of other masks or settings.
+        InvalidParameter: the folder holds a training of other masks or settings, or the model was not trained on one
+            of the masks.
         ParityError: the exported graphs disagree with the network.
     """
     manifest, _ = read_manifest(folder)
+    check_seen(manifest, cohort.train)
     windows = windows_of(cohort.train)
     config = completion_config(cohort, windows, reflect=reflect, steps=steps, seed=seed)
     masks = [mask_digest(case) for case in cohort.train]

@@ -16,6 +16,8 @@ from model.errors import InvalidParameter
 from model.geometry import CanonicalLattice
 from model.networks.completion import CompletionNet, CompletionShape
 from training.completion.samples import Sample, random_sample
+from training.difference import first_difference
+from training.interruption import Interruption
 from training.points import Window
 
 CHECKPOINT = "completion.pt"
@@ -78,6 +80,7 @@ def train_completion(
 
     Raises:
         InvalidParameter: the checkpoint is of other masks or settings.
+        Stopped: interrupted from the keyboard; the checkpoint holds every step that was made.
     """
     made_of = {"config": asdict(config), "masks": list(masks)}
     half = _has_matrix_units(device) if half is None else half
@@ -86,7 +89,7 @@ def train_completion(
     optimiser = torch.optim.AdamW(net.parameters(), config.learning_rate, weight_decay=config.weight_decay)
     begin = _resumed(net, optimiser, made_of, folder / CHECKPOINT)
     folder.mkdir(parents=True, exist_ok=True)
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    with Interruption() as interruption, ThreadPoolExecutor(torch.get_num_threads()) as pool:
         for step in range(begin, config.steps):
             for group in optimiser.param_groups:
                 group["lr"] = config.learning_rate * _share(step, config.steps)
@@ -100,8 +103,9 @@ def train_completion(
             torch.nn.utils.clip_grad_norm_(net.parameters(), LONGEST_GRADIENT)
             optimiser.step()
             watch(step + 1, loss.item())
-            if (step + 1) % SAVED_EVERY == 0 or step + 1 == config.steps:
+            if interruption.came or (step + 1) % SAVED_EVERY == 0 or step + 1 == config.steps:
                 _save(net, optimiser, made_of, step + 1, folder / CHECKPOINT)
+            interruption.stop_at(step + 1, config.steps)
     return net.cpu().eval()
 
 
@@ -150,10 +154,11 @@ def _resumed(net: CompletionNet, optimiser: torch.optim.Optimizer, made_of: Mapp
     if not path.is_file():
         return 0
     state = torch.load(path, map_location="cpu", weights_only=True)
-    if {name: state.get(name) for name in made_of} != made_of:
+    found = first_difference({name: state.get(name) for name in made_of}, made_of)
+    if found:
         raise InvalidParameter(
-            "The training in the folder of the run was made of other masks or settings; the same ones, or another "
-            "folder, are accepted.",
+            f"The training in the folder of the run was made of other masks or settings ({found}); the same ones, or "
+            "another folder, are accepted.",
             part="run",
         )
     net.load_state_dict(state["net"])

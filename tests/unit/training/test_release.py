@@ -20,6 +20,7 @@ from training.config import TrainingConfig
 from training.pruning import PriorParts
 from training.release import active_dimensions, export_run, load_module, wants_prior
 from training.runs import RECORD, half_extent, read_record, train_cohort
+from training.seen import short_digest
 
 CONFIG = TrainingConfig(
     decoder=DecoderShape(latent_size=3, width=8, depth=2),
@@ -76,6 +77,7 @@ class TestExport:
         assert manifest.half_extent_mm == tuple(half_extent(ellipsoid_cohort()))
         assert manifest.active_dimensions == active_dimensions(np.array(manifest.sigmas))
         assert manifest.training["shapes"] == 4
+        assert sorted(map(short_digest, ellipsoid_cohort().train)) == list(manifest.training_masks)
 
     def test_every_file_is_listed_with_its_hash(self, released):
         manifest, output = released

@@ -1,3 +1,4 @@
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from model.networks.prior import PriorShape
 from tests.analytic_shapes import Ellipsoid
 from training.cohorts import Case, Cohort, Provenance
 from training.config import TrainingConfig
+from training.interruption import Stopped
 from training.release import active_dimensions
 from training.runs import half_extent, mask_digest, read_record, train_cohort
 
@@ -50,6 +52,25 @@ def test_an_interrupted_run_ends_as_an_unbroken_one(tmp_path):
         ellipsoids(), CONFIG, tmp_path / "two", resume=True, watch=lambda step, figures: steps.append(step)
     )
     assert steps == list(range(17, 25))
+    for name, value in unbroken.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name
+
+
+def test_an_interrupt_from_the_keyboard_loses_no_step(tmp_path):
+    def interrupt(step, _figures):
+        if step == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    config, before = replace(CONFIG, steps=5), signal.getsignal(signal.SIGINT)
+    unbroken = train_cohort(ellipsoids(), config, tmp_path / "one")
+    with pytest.raises(Stopped, match="stopped at step 3 of 5"):
+        train_cohort(ellipsoids(), config, tmp_path / "two", watch=interrupt)
+    assert signal.getsignal(signal.SIGINT) is before
+    steps = []
+    resumed = train_cohort(
+        ellipsoids(), config, tmp_path / "two", resume=True, watch=lambda step, figures: steps.append(step)
+    )
+    assert steps == [4, 5]
     for name, value in unbroken.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
 

@@ -1,5 +1,6 @@
 """A small completion network learns ellipsoids, and goes on where it was left."""
 
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from tests.analytic_shapes import Ellipsoid
 from training.cohorts.cohort import Case
 from training.completion.samples import random_sample, windows_of
 from training.completion.trainer import CHECKPOINT, SAVED_EVERY, CompletionConfig, completion_loss, train_completion
+from training.interruption import Stopped
 
 GRID = Grid((30, 30, 30), np.diag([1.0, 1.0, 1.0, 1.0]))
 MIDDLE = np.full(3, 14.5)
@@ -68,6 +70,20 @@ def test_a_training_that_was_ended_goes_on_to_the_same_network(tmp_path):
     assert steps == list(range(SAVED_EVERY + 1, SAVED_EVERY + 11))
     for name, value in whole.state_dict().items():
         torch.testing.assert_close(resumed.state_dict()[name], value, rtol=0.0, atol=0.0)
+
+
+def test_an_interrupt_from_the_keyboard_loses_no_step(tmp_path):
+    config = replace(CONFIG, steps=3, width=4, batch=1)
+
+    def interrupt(step, _):
+        if step == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(Stopped, match="stopped at step 2 of 3"):
+        train_completion(WINDOWS, config, tmp_path, half=False, watch=interrupt)
+    steps = []
+    train_completion(WINDOWS, config, tmp_path, half=False, watch=lambda step, loss: steps.append(step))
+    assert steps == [3]
 
 
 @pytest.mark.parametrize("other", [{"config": replace(CONFIG, steps=3, width=4, batch=1)}, {"masks": ("b",)}])
