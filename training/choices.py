@@ -38,6 +38,13 @@ class SplitName(StrEnum):
     TEST = "test"
 
 
+#: What to do where a split has no cases.
+OTHER_SPLIT = {
+    SplitName.TEST: "train with --test-fraction and say the same here, or measure with --split validation",
+    SplitName.VALIDATION: "measure with --split test, or train on a larger cohort",
+}
+
+
 class ObjectiveName(StrEnum):
     """Which objective is minimised."""
 
@@ -151,3 +158,17 @@ def with_patience(config: "TrainingConfig", patience: int) -> "TrainingConfig":
         return config
     every = max(1, config.steps // VALIDATIONS)
     return replace(config, patience=patience, validate_every=every)
+
+
+def anatomy_code(words: str | None) -> dict[str, str]:
+    """A SNOMED CT code and its meaning as they stand in a manifest.
+
+    Raises:
+        InvalidParameter: no code of 6 to 18 digits followed by its meaning.
+    """
+    if words is None:
+        return {}
+    value, _, meaning = words.strip().partition(" ")
+    if not (value.isdecimal() and 6 <= len(value) <= 18 and meaning.strip()):
+        raise InvalidParameter("A SNOMED CT code and its meaning are accepted, as '67453005 Talus'.", part="anatomy")
+    return {"value": value, "scheme": "SCT", "meaning": meaning.strip()}

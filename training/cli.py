@@ -1,7 +1,7 @@
-"""The commands train, export, calibrate and evaluate; torch is imported when a command needs it.
+"""The commands train, export, complete, calibrate, evaluate, sweep and report; torch is imported when one needs it.
 
 Results go to standard output, what was refused or peculiar to standard error. Exit status: 0, 2 for input that
-cannot be used (masks, models, values), 1 for a fault.
+cannot be used (masks, models, values), 1 for a fault, 130 for a training that was interrupted.
 """
 
 import json
@@ -12,13 +12,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from model.errors import InvalidParameter
+from training import expectations
 from training.choices import (
     LEAST_MOVEMENT,
     LEAST_OF_TRAINING,
+    OTHER_SPLIT,
     DeviceName,
     ObjectiveName,
     RegimeName,
     SplitName,
+    anatomy_code,
     configured,
     resolved,
     with_batches,
@@ -28,7 +31,7 @@ from training.choices import (
 from training.cohort_options import takes_cohort
 from training.cohorts import Cohort, CohortOptions
 from training.cohorts.sources import CohortSource, open_cohort
-from training.console import exit_status, finding_counts, progress, tell_findings
+from training.console import check_output, exit_status, finding_counts, progress, tell_findings, warn
 from training.reporting.command import report
 from training.sweep.command import sweep
 
@@ -59,7 +62,7 @@ def register(app: typer.Typer) -> None:
 def train(
     source: CohortSource,
     options: CohortOptions,
-    regime: Annotated[RegimeName, typer.Option(help="How sparse the training masks are made.")] = RegimeName.DENSE,
+    regime: Annotated[RegimeName, typer.Option(help="How sparse the training shapes are made.")] = RegimeName.DENSE,
     objective: Annotated[ObjectiveName, typer.Option(help="What is minimised.")] = ObjectiveName.VARIATIONAL,
     latent_size: Annotated[int, typer.Option(min=1, max=1024, help="Dimensions of the latent code.")] = 64,
     steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps.")] = None,
@@ -86,14 +89,21 @@ def train(
         int, typer.Option(min=0, help="End after so many validations without a better figure; 0 never does.")
     ] = 0,
     device: Annotated[DeviceName, typer.Option(help="Where to compute.")] = DeviceName.AUTO,
-    output: Annotated[Path | None, typer.Option(help="Folder of the run.")] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder of the run; runs/COHORT-REGIME when left out.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in the output folder.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train a shape model on a cohort of masks."""
-    with exit_status():
+    """Train a shape model on a cohort of masks or of meshes."""
+    with exit_status(goes_on="--resume goes on"):
+        from training.runs import check_free
+
+        if output is not None:
+            check_output(output, is_folder=True)
+        if output is not None and not resume:
+            check_free(output)
         found = open_cohort(source, options)
         tell_findings(found)
+        warn(expectations.of_training(found))
         known = source.cohort is not None and found.reflects and objective is not ObjectiveName.PAPER
         paired = known if reflect is None else reflect
         config = configured(
@@ -110,6 +120,8 @@ def train(
         codes = (2 if paired else 1) * len(found.train)
         config = with_patience(with_duration(with_batches(config, codes), steps, epochs, codes), patience)
         folder = output or Path("runs") / f"{found.name}-{regime}"
+        if not resume:
+            check_free(folder)
         figures = _train_with_progress(found, config, folder, resume=resume)
         _print_run(found, config, folder, figures, as_json=as_json)
 
@@ -152,11 +164,10 @@ def export(
 ) -> None:
     """Export a run as a bundle that the service loads."""
     with exit_status():
-        from model.bundle import check_names
         from training.pruning import PriorParts
-        from training.release import export_run, wants_prior
+        from training.release import STAGES, export_run, wants_prior
 
-        check_names(name, version)
+        check_output(output, is_folder=True)
         stood_still = wants_prior(run)
         fitted = stood_still if prune is None else prune
         parts = PriorParts(least_movement=least_movement, least_of_training=training_share)
@@ -168,15 +179,18 @@ def export(
                     part="cohort",
                 )
             parts = _parts_for(run, parts, source, options)
-        manifest = export_run(
-            run,
-            output,
-            name=name,
-            version=version,
-            parts=parts if fitted else None,
-            anatomy=anatomy_code(anatomy),
-            resolution_mm=resolution_mm,
-        )
+        code = anatomy_code(anatomy)
+        with progress(len(STAGES), "exporting") as bar:
+            manifest = export_run(
+                run,
+                output,
+                name=name,
+                version=version,
+                parts=parts if fitted else None,
+                anatomy=code,
+                resolution_mm=resolution_mm,
+                watch=lambda words: bar.update(bar.task_ids[0], description=words, completed=STAGES.index(words)),
+            )
         summary = {
             "bundle": str(output),
             "name": manifest.name,
@@ -202,26 +216,17 @@ def _parts_for(run: Path, parts: "PriorParts", source: CohortSource, options: Co
     return choice.parts
 
 
-def anatomy_code(words: str | None) -> dict[str, str]:
-    """A SNOMED CT code and its meaning as they stand in a manifest.
-
-    Raises:
-        InvalidParameter: no code of 6 to 18 digits followed by its meaning.
-    """
-    if words is None:
-        return {}
-    value, _, meaning = words.strip().partition(" ")
-    if not (value.isdecimal() and 6 <= len(value) <= 18 and meaning.strip()):
-        raise InvalidParameter("A SNOMED CT code and its meaning are accepted, as '67453005 Talus'.", part="anatomy")
-    return {"value": value, "scheme": "SCT", "meaning": meaning.strip()}
-
-
 @takes_cohort
 def complete(
     source: CohortSource,
     options: CohortOptions,
     bundle: Annotated[Path, typer.Argument(help="Folder of an exported bundle; the network is put into it.")],
-    run: Annotated[Path | None, typer.Option(help="Folder of the checkpoint, from which training goes on.")] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the checkpoint, from which training goes on; runs/COHORT-completion when left out."
+        ),
+    ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps.")] = None,
     reflect: Annotated[
         bool | None,
@@ -237,9 +242,14 @@ def complete(
     with exit_status():
         from training.completion.release import complete_bundle
         from training.completion.trainer import STEPS
+        from training.evaluate import given_bundle
 
+        given_bundle(bundle)
+        if run is not None:
+            check_output(run, is_folder=True)
         found = open_cohort(source, options)
         tell_findings(found)
+        warn(expectations.of_completion(found))
         folder = run or Path("runs") / f"{found.name}-completion"
         with progress(steps or STEPS, f"learning to complete {found.name}") as bar:
             config = complete_bundle(
@@ -268,11 +278,14 @@ def calibrate(
     with exit_status():
         from model.bundle import read_manifest
         from training.calibration import calibrate_bundle, stages
+        from training.evaluate import given_bundle
 
+        before = given_bundle(bundle)
         found = open_cohort(source, options)
         if not found.validation:
             raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
-        with progress(stages(read_manifest(bundle)[0]), f"calibrating on {found.name}") as bar:
+        warn(expectations.of_calibration(found))
+        with progress(stages(before), f"calibrating on {found.name}") as bar:
             chosen = calibrate_bundle(bundle, found, lambda precision: bar.advance(bar.task_ids[0]))
         best, manifest = chosen.best, read_manifest(bundle)[0]
         spread_mm, share = manifest.discrepancy["spread_mm"], manifest.completion.get("share")
@@ -311,12 +324,16 @@ def evaluate(
         from training.evaluate import find_bundle, open_named, shipped_bundles
         from training.report import as_json as json_of
         from training.report import as_text, record_accuracy, summarise, write_csv
+        from training.seen import check_unseen
 
+        if output is not None:
+            check_output(output, is_folder=False)
         opened = open_named(model)
         found = open_cohort(source, options)
         cases = found.of_split(split.value)[:limit]
         if not cases:
-            raise InvalidParameter(f"The cohort has no {split} cases; the other split is accepted.", part="split")
+            raise InvalidParameter(f"The cohort has no {split} cases; {OTHER_SPLIT[split]}.", part="split")
+        check_unseen(opened.manifest, cases, split.value)
         regimes = tuple(regime or (RegimeName.THIN, RegimeName.THICK, RegimeName.ORTHOGONAL))
         measured = _evaluate_with_progress(opened, cases, regimes, offset, options.seed)
         if output is not None:

@@ -1,26 +1,38 @@
 """What the training commands have in common: exit status, findings, progress on a terminal."""
 
+import os
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from model.errors import CohortError, InputError, MorphoFlowError, NotFound
+from model.errors import CohortError, InputError, InvalidParameter, MorphoFlowError, NotFound
 from training.cohorts import Cohort
+from training.interruption import Stopped
 
 #: Errors that the caller can mend.
 BAD_INPUT = (InputError, CohortError, NotFound)
 BAD_INPUT_STATUS, FAULT_STATUS = 2, 1
+#: 128 and the number of the signal.
+STOPPED_STATUS = 130
 
 
 @contextmanager
-def exit_status() -> Iterator[None]:
-    """Turn the project's errors, and libraries that are not there, into a sentence and an exit status."""
+def exit_status(*, goes_on: str = "the same command goes on") -> Iterator[None]:
+    """Turn the project's errors, libraries that are not there and interrupts into a sentence and an exit status.
+
+    Args:
+        goes_on: how a training that was stopped is continued.
+    """
     try:
         yield
+    except Stopped as stopped:
+        typer.echo(f"morphoflow: {stopped}; {goes_on}", err=True)
+        raise typer.Exit(STOPPED_STATUS) from stopped
     except MorphoFlowError as error:
         typer.echo(f"morphoflow: {error}", err=True)
         raise typer.Exit(BAD_INPUT_STATUS if isinstance(error, BAD_INPUT) else FAULT_STATUS) from error
@@ -28,6 +40,32 @@ def exit_status() -> Iterator[None]:
         library = (error.name or "a library").split(".")[0]
         typer.echo(f"morphoflow: this command needs {library}: pip install 'morphoflow[training]'", err=True)
         raise typer.Exit(BAD_INPUT_STATUS) from error
+    except OSError as error:
+        if error.filename is None:
+            raise
+        typer.echo(f"morphoflow: {error.filename} cannot be read or written: {error.strerror}", err=True)
+        raise typer.Exit(BAD_INPUT_STATUS) from error
+
+
+def check_output(path: Path, *, is_folder: bool) -> None:
+    """Whether a file or folder can be written there, told before the work.
+
+    Raises:
+        InvalidParameter: something else is in its way, or its folder is write-protected.
+    """
+    there = next(one for one in (path, *path.parents, Path()) if one.exists())
+    blocked = not there.is_dir() if is_folder or there != path else there.is_dir()
+    if blocked or not os.access(there, os.W_OK):
+        kind = "folder" if is_folder else "file"
+        raise InvalidParameter(
+            f"The output cannot be written; a {kind} in a folder that can be written to is accepted.", part="output"
+        )
+
+
+def warn(words: str) -> None:
+    """Write to standard error what is to be expected; nothing where there are no words."""
+    if words:
+        typer.echo(f"note: {words}", err=True)
 
 
 @contextmanager

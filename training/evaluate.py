@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from model.bundle import ShapeModel, open_bundle
-from model.errors import InputError, UnknownModel
+from model.bundle import MANIFEST, Manifest, ShapeModel, open_bundle, read_manifest
+from model.errors import InputError, InvalidParameter, UnknownModel
 from model.geometry import Grid
 from model.inference.reconstruction import Options, reconstruct
 from model.inference.uncertainty import occupancy
@@ -66,9 +66,31 @@ def find_bundle(name_or_folder: str, folders: Iterable[Path]) -> Path:
         UnknownModel: neither is there.
     """
     for folder in (Path(name_or_folder), *(root / name_or_folder for root in folders)):
-        if (folder / "manifest.json").is_file():
+        if (folder / MANIFEST).is_file():
             return folder
+    if Path(name_or_folder).name != name_or_folder and not Path(name_or_folder).exists():
+        raise UnknownModel(
+            "The folder of the model does not exist; the name of a shipped model or the folder of a bundle is accepted."
+        )
     raise UnknownModel("No such model; the name of a shipped model or the folder of a bundle is accepted.")
+
+
+def given_bundle(folder: Path) -> Manifest:
+    """Manifest of a bundle that was named by its folder.
+
+    Raises:
+        InvalidParameter: it is not there.
+        BundleError: it is there and cannot be trusted.
+    """
+    if not folder.is_dir():
+        raise InvalidParameter(
+            "The folder of the bundle does not exist; one written by morphoflow export is accepted.", part="bundle"
+        )
+    if not (folder / MANIFEST).is_file():
+        raise InvalidParameter(
+            f"The bundle has no {MANIFEST}; a folder written by morphoflow export is accepted.", part="bundle"
+        )
+    return read_manifest(folder)[0]
 
 
 def shipped_bundles() -> Path:

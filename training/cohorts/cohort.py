@@ -140,4 +140,5 @@ def refusal_error(refused: Sequence[Refusal], *, nothing_left: bool = False) -> 
     """The error that lists each refused case and why."""
     head = "No case is left to train on" if nothing_left else f"{len(refused)} case(s) must not be used"
     reasons = "; ".join(f"{refusal.name}: {refusal.reason}" for refusal in refused)
-    return CohortError(f"{head}: {reasons or 'the cohort holds no masks, NIfTI, NRRD or MetaImage is accepted'}")
+    tail = "" if nothing_left else "; --skip-refused goes on without them"
+    return CohortError(f"{head}: {reasons or 'the cohort holds no masks, NIfTI, NRRD or MetaImage is accepted'}{tail}")

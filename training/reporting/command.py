@@ -9,7 +9,7 @@ import typer
 
 from model.errors import CohortError, InvalidParameter
 from training.cohorts.sources import open_cohort
-from training.console import exit_status, progress
+from training.console import check_output, exit_status, progress
 
 if TYPE_CHECKING:
     from training.reporting.page import Chapter
@@ -36,6 +36,8 @@ def report(
         from training.reporting.page import page
         from training.reporting.tables import write_table
 
+        check_output(output, is_folder=False)
+        _check_sweeps(sweeps)
         with progress(PANELS * len(sweeps), "drawing panels") as bar:
             chapters = [
                 _chapter(folder, pictures, published_only, lambda name: bar.advance(bar.task_ids[0]))
@@ -49,14 +51,28 @@ def report(
         typer.echo(json.dumps(summary) if as_json else f"{output} and {table} written")
 
 
+def _check_sweeps(sweeps: list[Path]) -> None:
+    """Every folder holds results, told before anything is drawn."""
+    from training.sweep.table import read_results
+
+    for number, folder in enumerate(sweeps, 1):
+        fault = "does not exist"
+        if folder.is_dir():
+            try:
+                fault = "" if read_results(folder) else "has no finished cell"
+            except InvalidParameter:
+                fault = "holds no results"
+        if fault:
+            name = f"Folder {number} of {len(sweeps)} ({folder.name})"
+            raise InvalidParameter(f"{name} {fault}; one written by morphoflow sweep is accepted.", part="sweeps")
+
+
 def _chapter(folder: Path, pictures: bool, published_only: bool, watch: Callable[[str], None]) -> "Chapter":
     from training.reporting.chapters import chapter_of
     from training.sweep.record import read_record
     from training.sweep.table import read_results
 
     results = read_results(folder)
-    if not results:
-        raise InvalidParameter("The sweep has no finished cell; one with results is accepted.", part="sweeps")
     shown = pictures and (not published_only or all(result.shippable for result in results))
     cohort = None
     if shown:

@@ -89,6 +89,7 @@ class TestTrain:
         stopped = run(*words)
         assert stopped.exit_code == 2
         assert "whale: it does not belong to the cohort: volume" in stopped.stderr
+        assert "--skip-refused goes on without them" in stopped.stderr
         assert not (tmp_path / "run").exists()
         skipped = run(*words, "--skip-refused", "--json")
         assert skipped.exit_code == 0
@@ -124,6 +125,36 @@ class TestTrain:
         assert result.exit_code == 2
         assert sentence in result.stderr
         assert "Traceback" not in result.output
+
+    def test_what_stands_in_the_way_is_told_before_the_cohort_is_opened(self, run, tmp_path):
+        (tmp_path / "file").write_text("here")
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run" / "run.json").write_text("{}")
+        for words, sentence in (
+            (("train", "--output", tmp_path / "file" / "x"), "output cannot be written"),
+            (("train", "--output", tmp_path / "run"), "holds a run already"),
+            (("calibrate", tmp_path / "gone"), "folder of the bundle does not exist"),
+            (("complete", tmp_path / "gone"), "folder of the bundle does not exist"),
+            (("calibrate", tmp_path), "has no manifest.json"),
+            (("evaluate", "--model", tmp_path / "gone"), "folder of the model does not exist"),
+            (("evaluate", "--model", "talus", "--output", tmp_path / "file" / "x"), "output cannot be written"),
+        ):
+            result = run(*words, "--masks", "nowhere")
+            assert result.exit_code == 2
+            assert sentence in result.stderr
+
+    def test_a_single_shape_is_refused_and_few_are_told_of(self, run, masks, tmp_path):
+        write(tmp_path / "one", "e", ellipsoid(0))
+        assert "cannot tell how shapes differ" in run("train", "--masks", tmp_path / "one", *SMALL).stderr
+        result = run("train", "--masks", masks, *SMALL, "--output", tmp_path / "run")
+        assert "note: 5 training shapes are few" in result.stderr
+
+    def test_reports_name_the_folder_at_fault(self, run, tmp_path):
+        (tmp_path / "empty").mkdir()
+        for folder, words in (("gone", "does not exist"), ("empty", "holds no results")):
+            result = run("report", tmp_path / folder, "--output", tmp_path / "page.html")
+            assert result.exit_code == 2
+            assert f"Folder 1 of 1 ({folder}) {words}" in result.stderr
 
     def test_steps_and_epochs_exclude_each_other(self, run, masks):
         result = run("train", "--masks", masks, *SMALL, "--epochs", 2)
@@ -350,4 +381,21 @@ class TestEvaluate:
             write(tmp_path / "train", f"e{n}", ellipsoid(n))
         result = run("evaluate", "--model", bundle, "--masks", tmp_path)
         assert result.exit_code == 2
-        assert "no test cases" in result.stderr
+        assert "no test cases; train with --test-fraction" in result.stderr
+
+    def test_shapes_of_the_training_are_not_measured_on(self, run, bundle):
+        masks = bundle.parent / "masks"
+        before = (bundle / "manifest.json").read_bytes()
+        held = json.loads((bundle.parent / "run" / "run.json").read_text(encoding="utf-8"))["validation"]
+        options = (CohortOptions(seed=seed) for seed in range(1, 9))
+        seed = next(one.seed for one in options if held_out(masks, one) != held)
+        for words in (
+            ("calibrate", bundle, "--seed", seed),
+            ("evaluate", "--model", bundle, "--split", "validation", "--seed", seed),
+            ("evaluate", "--model", bundle, "--test-fraction", 0.4),
+        ):
+            result = run(*words, "--masks", masks)
+            assert result.exit_code == 2
+            assert "was trained on" in result.stderr
+            assert "--test-fraction" in result.stderr
+        assert (bundle / "manifest.json").read_bytes() == before

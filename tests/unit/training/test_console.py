@@ -1,0 +1,77 @@
+"""Errors and interrupts as a sentence and an exit status; what is told before the work."""
+
+from pathlib import Path
+
+import pytest
+import typer
+
+from model.errors import InvalidParameter
+from tests.ellipsoid_cohort import GRID, ellipsoids
+from training import expectations
+from training.cohorts import Case, Cohort, Provenance
+from training.console import check_output, exit_status
+from training.interruption import Stopped
+
+
+def test_an_interrupt_says_how_the_training_goes_on(capsys):
+    with pytest.raises(typer.Exit) as caught, exit_status(goes_on="--resume goes on"):
+        raise Stopped(3, 9)
+    assert caught.value.exit_code == 130
+    assert capsys.readouterr().err == "morphoflow: stopped at step 3 of 9; --resume goes on\n"
+
+
+def test_a_path_that_cannot_be_used_is_one_sentence(capsys, tmp_path):
+    (tmp_path / "file").write_text("here")
+    with pytest.raises(typer.Exit) as caught, exit_status():
+        (tmp_path / "file" / "x").mkdir()
+    assert caught.value.exit_code == 2
+    words = capsys.readouterr().err
+    assert "cannot be read or written: Not a directory" in words
+    assert len(words.splitlines()) == 1
+
+
+class TestOutput:
+    def test_what_is_not_there_yet_is_accepted(self, tmp_path):
+        (tmp_path / "file.csv").write_text("old")
+        check_output(tmp_path, is_folder=True)
+        check_output(tmp_path / "new" / "run", is_folder=True)
+        check_output(tmp_path / "new" / "page.html", is_folder=False)
+        check_output(tmp_path / "file.csv", is_folder=False)
+        check_output(Path("page.html"), is_folder=False)
+
+    def test_what_is_in_the_way_is_told_of(self, tmp_path):
+        (tmp_path / "file").write_text("here")
+        for path, is_folder in (
+            (tmp_path / "file" / "x", True),
+            (tmp_path / "file", True),
+            (tmp_path / "file" / "x.html", False),
+            (tmp_path, False),
+            (Path("/dev/null/x"), True),
+        ):
+            with pytest.raises(InvalidParameter, match="cannot be written"):
+                check_output(path, is_folder=is_folder)
+
+
+def cohort(train, validation):
+    cases = tuple(Case(f"e{n}", f"e{n}", "train", shape.mask(GRID), GRID) for n, shape in enumerate(ellipsoids(1)))
+    provenance = Provenance("made here", "CC0-1.0", "nobody", shippable=True)
+    return Cohort("ellipsoids", train * cases, validation * cases, (), (), provenance)
+
+
+class TestExpectations:
+    @pytest.mark.parametrize(
+        ("told", "few", "enough"),
+        [
+            (expectations.of_training, cohort(9, 0), cohort(10, 0)),
+            (expectations.of_calibration, cohort(50, 3), cohort(5, 4)),
+            (expectations.of_completion, cohort(49, 9), cohort(50, 0)),
+        ],
+    )
+    def test_few_shapes_are_told_of(self, told, few, enough):
+        assert "few" in told(few)
+        assert told(enough) == ""
+
+    def test_one_shape_makes_no_model(self):
+        with pytest.raises(InvalidParameter, match="1 training shape"):
+            expectations.of_training(cohort(1, 1))
+        assert expectations.of_training(cohort(2, 1))
