@@ -164,9 +164,11 @@ def export(
 ) -> None:
     """Export a run as a bundle that the service loads."""
     with exit_status():
+        from model.bundle import check_names
         from training.pruning import PriorParts
         from training.release import STAGES, export_run, wants_prior
 
+        check_names(name, version)
         check_output(output, is_folder=True)
         stood_still = wants_prior(run)
         fitted = stood_still if prune is None else prune

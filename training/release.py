@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from model.bundle import POPULATION, Manifest, Population, ShapeModel, file_digest, write_manifest
+from model.bundle import POPULATION, Manifest, Population, ShapeModel, file_digest, plain_name, write_manifest
 from model.errors import InvalidParameter
 from model.networks.decoder import OccupancyDecoder
 from model.networks.export import export_graphs, quiet_exporter, torch_networks
@@ -65,7 +65,7 @@ def export_run(
     np.savez(output / POPULATION, **asdict(found.population()))
     manifest = replace(
         found.manifest(),
-        name=name or found.record["cohort"],
+        name=plain_name(found.record["cohort"]) if name is None else name,
         version=version,
         resolution_mm=resolution_mm,
         likelihood_precision=likelihood_precision,
