@@ -15,6 +15,7 @@ from service.schemas import ResultSummary
 from service.settings import SETTINGS_FILE_VARIABLE, Settings
 from tests.contract.test_openapi import operations
 from training.cli import register
+from training.cohorts import CohortName
 
 
 @pytest.fixture(scope="module")
@@ -62,14 +63,17 @@ def test_commands_and_their_options_stand_in_the_docs(page):
 def test_training_commands_and_their_options_stand_in_the_docs(repository):
     app = typer.Typer()
     register(app)
-    pages = [repository / "docs" / "training.md", repository / "benchmarks" / "README.md"]
-    text = "".join(path.read_text(encoding="utf-8") for path in pages)
+    text = (repository / "docs" / "training.md").read_text(encoding="utf-8")
     for name, command in typer.main.get_command(app).commands.items():
         assert f"morphoflow {name}" in text
-        if name in ("sweep", "report"):
-            for parameter in command.params:
-                for option in (word for word in parameter.opts if word.startswith("--")):
-                    assert f"{option}`" in text or f"{option} " in text
+        for parameter in command.params:
+            for option in (word for word in parameter.opts if word.startswith("--")):
+                assert f"{option}`" in text or f"{option} " in text, (name, option)
+
+
+@pytest.mark.parametrize("name", list(CohortName))
+def test_public_cohorts_stand_in_the_docs(repository, name):
+    assert f"| `{name}` | `{name}/" in (repository / "docs" / "training.md").read_text(encoding="utf-8")
 
 
 def test_problems_stand_in_the_docs_with_their_status(page):
