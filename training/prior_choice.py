@@ -23,6 +23,7 @@ from training.evaluate import surface_distance
 from training.pruning import PriorParts
 from training.release import trial_model
 from training.runs import mask_digest, read_record
+from training.seen import listed, short_digest
 
 #: Drawings of validation shapes that are reconstructed.
 REGIMES: tuple[Regime, ...] = ("thin", "orthogonal")
@@ -89,12 +90,13 @@ def chosen_parts(
 
 
 def _check_unseen(run: Path, cases: Sequence[Case]) -> None:
-    seen = set(read_record(run)[1]["train"].values())
-    names = [case.name for case in cases if mask_digest(case) in seen]
+    values = read_record(run)[1]
+    seen = {*values["train"].values(), *values.get("voxels", ())}
+    names = [case.name for case in cases if not seen.isdisjoint((mask_digest(case), short_digest(case)))]
     if names:
         raise InvalidParameter(
-            f"The run was trained on {names[0]}, which is to be a validation case; the cohort, and the seed, of the "
-            "training are accepted.",
+            f"The run was trained on {listed(names)}, which is to be among the validation cases; the cohort, --seed "
+            "and --test-fraction of the training are accepted.",
             part="cohort",
         )
 
