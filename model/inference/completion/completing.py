@@ -4,12 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import map_coordinates
 
 from model.bundle import ShapeModel
 from model.geometry import CanonicalLattice
 from model.inference.completion.drawn import drawn_at
 from model.inference.completion.field import Completion
-from model.inference.discrepancy.levels import saturated
+from model.inference.discrepancy.levels import REACH_MM, saturated
 from model.inference.fit_types import Fit
 from model.inference.mask_stack import MaskStack
 from model.inference.observations import Observations
@@ -46,11 +47,25 @@ def completed(
     steepness = _slope(logits, network.lattice.step_mm)
     if steepness is None:
         return None
-    of_code = model.decoder.logits(found.latent[None], points[None])[0].reshape(logits.shape)
-    more = saturated(logits / steepness) - saturated(of_code / slope)
+    more = saturated(logits / steepness) - saturated(code_logits(model, found, network.lattice, slope) / slope)
     return Completion(
         network.lattice, share * trust_in_place(found, network.lattice) * weights_of(network.lattice) * more
     )
+
+
+def code_logits(model: ShapeModel, found: Fit, lattice: CanonicalLattice, slope: float) -> Float[np.ndarray, "i j k"]:
+    """The code's logits on a lattice; interpolated from every other voxel where distances hardly count any more.
+
+    Args:
+        slope: of the decoder's field at the surface (1/mm).
+    """
+    points = lattice.points().reshape(*lattice.voxels, 3)
+    coarse = points[::2, ::2, ::2]
+    known = model.decoder.logits(found.latent[None], coarse.reshape(1, -1, 3))[0].reshape(coarse.shape[:3])
+    logits = map_coordinates(known, np.indices(lattice.voxels) / 2.0, order=3, mode="nearest")
+    near = np.abs(logits) < REACH_MM * slope
+    logits[near] = model.decoder.logits(found.latent[None], points[near][None])[0]
+    return np.asarray(logits)
 
 
 def trust_in_place(found: Fit, lattice: CanonicalLattice) -> float:

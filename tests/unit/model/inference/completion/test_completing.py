@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 from model.geometry import Pose
-from model.inference.completion.completing import PLACED_STEPS, completed, trust_in_place, weights_of
+from model.inference.completion.completing import PLACED_STEPS, code_logits, completed, trust_in_place, weights_of
 from model.inference.discrepancy.conditioning import DiscrepancyPrior
-from model.inference.discrepancy.levels import saturated
+from model.inference.discrepancy.levels import REACH_MM, saturated
 from model.inference.fitting import FitOptions, fit
 from model.inference.reconstruction import Options, reconstruct
 from model.inference.reliability import figures_of
@@ -85,6 +85,15 @@ class TestWhatBecomesOfIt:
             expected = saturated(sphere(9.0).logits(LATTICE.points())) - saturated(code / SLOPE)
             inner = weights_of(LATTICE).ravel() == 1.0
             np.testing.assert_allclose(found.shifts.ravel()[inner], 0.5 * expected[inner], atol=0.06)
+
+    def test_the_code_is_known_everywhere_as_far_as_it_counts(self):
+        everywhere = MODEL.decoder.logits(FOUND.latent[None], LATTICE.points()[None])[0].reshape(LATTICE.voxels)
+        found = code_logits(MODEL, FOUND, LATTICE, SLOPE)
+        near = np.abs(found) < REACH_MM * SLOPE
+        assert 0 < near.sum() < near.size
+        np.testing.assert_allclose(found[near], everywhere[near], atol=1e-5)
+        gap = np.abs(saturated(found / SLOPE) - saturated(everywhere / SLOPE))
+        assert gap[weights_of(LATTICE) > 0.0].max() < 0.05
 
     def test_it_counts_less_where_the_place_is_not_known(self):
         model = completing(MODEL, BallCompleter(9.0), 0.5)
