@@ -28,9 +28,9 @@ FORMAT = 1
 MANIFEST = "manifest.json"
 POPULATION = "population.npz"
 #: Names and versions of models: they stand in addresses, in names of files, and on either side of an ``@``.
-PLAIN_NAME = re.compile(r"[a-z0-9][a-z0-9._-]*")
+PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
 #: What such a name is made of, in words.
-PLAIN_WORDS = "small letters, digits, '.', '_' and '-', with a letter or a digit first"
+PLAIN_WORDS = "letters from A to Z, digits, '.', '_', '+' and '-', with a letter or a digit first"
 #: Files without which there is nothing to run.
 REQUIRED_FILES = (
     POPULATION,

@@ -76,14 +76,14 @@ def test_writing_undoes_reading(bundle, tmp_path):
 
 
 @pytest.mark.parametrize("part", ["name", "version"])
-@pytest.mark.parametrize("text", ["My Bone", "a/b@c", "", ".hidden", "bone\n", "Knochen", "öl"])
+@pytest.mark.parametrize("text", ["My Bone", "a/b@c", "", ".hidden", "bone\n", "öl"])
 def test_a_name_that_no_address_could_hold_is_refused(bundle, part, text):
     edit(bundle, **{part: text})
-    with pytest.raises(BundleCorrupt, match="small letters"):
+    with pytest.raises(BundleCorrupt, match="letters from A to Z"):
         read_manifest(bundle)
-    edit(bundle, **{part: "bone-2.1_a"})
+    edit(bundle, **{part: "Bone-2.1_a+b"})
     manifest, _ = read_manifest(bundle)
-    with pytest.raises(InvalidParameter, match=f"The {part} .* small letters") as caught:
+    with pytest.raises(InvalidParameter, match=f"The {part} .* letters from A to Z") as caught:
         write_manifest(replace(manifest, **{part: text}), bundle)
     assert caught.value.part == part
 
