@@ -17,7 +17,7 @@ from model.inference.stacks import checked_labels
 from model.inference.surface import require_step
 from service import use_cases
 from service.commands import ExtentsOption, FidelityOption, ForceOption, JsonOption, ModelOption, RejectOption
-from service.console import bar, echo_json, require_free
+from service.console import bar, echo_json, require_free, writing
 from service.errors import NotReady
 from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobState, JobStatus
@@ -174,7 +174,7 @@ def _finish(jobs: JobEngine, blobs: BlobStore, status: JobStatus, output: Path |
             status = jobs.status(status.id)
             advance(status.kind, status.done, status.total)
     if status.state is JobState.DONE and output is not None and status.result is not None:
-        with zipfile.ZipFile(output, "w") as archive:
+        with writing("--output"), zipfile.ZipFile(output, "w") as archive:
             write_zip(archive, JobFiles(blobs, status.id), status.kind, status.result["count"])
     _tell(status, as_json=as_json)
     jobs.close()

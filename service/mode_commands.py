@@ -14,7 +14,7 @@ from model.inference.modes import FARTHEST_SD, ShapeModes, shape_modes
 from service import use_cases
 from service.adapters.mesh_formats import write_mesh
 from service.commands import ForceOption, JsonOption, ModelOption
-from service.console import echo_json, progress
+from service.console import echo_json, progress, writing
 from service.mode_presentation import mode_list
 from service.ports import MeshFormat
 from service.settings import load_settings
@@ -79,7 +79,8 @@ def _write(
         for name, coordinates in ends.items():
             step(name)
             mesh = use_cases.shape_along_modes(model, found, coordinates, spacing_mm, max_voxels)
-            paths[name].write_bytes(write_mesh(mesh, format.value, space=manifest.frame, metadata=said))
+            with writing("--output"):
+                paths[name].write_bytes(write_mesh(mesh, format.value, space=manifest.frame, metadata=said))
 
 
 def _require_free(folder: Path, paths: Iterable[Path], *, force: bool) -> None:
@@ -87,4 +88,5 @@ def _require_free(folder: Path, paths: Iterable[Path], *, force: bool) -> None:
         raise InvalidParameter("--output must be a folder.", part="--output")
     if not force and any(path.exists() for path in paths):
         raise InvalidParameter("--output holds such files already; --force overwrites them.", part="--output")
-    folder.mkdir(parents=True, exist_ok=True)
+    with writing("--output"):
+        folder.mkdir(parents=True, exist_ok=True)

@@ -38,7 +38,7 @@ def exit_status(*, goes_on: str = "the same command goes on") -> Iterator[None]:
         raise typer.Exit(BAD_INPUT_STATUS if isinstance(error, BAD_INPUT) else FAULT_STATUS) from error
     except ModuleNotFoundError as error:
         library = (error.name or "a library").split(".")[0]
-        typer.echo(f"morphoflow: this command needs {library}: pip install 'morphoflow[training]'", err=True)
+        typer.echo(f"morphoflow: this command needs {library}: pip install -c constraints.txt '.[training]'", err=True)
         raise typer.Exit(BAD_INPUT_STATUS) from error
     except OSError as error:
         if error.filename is None:

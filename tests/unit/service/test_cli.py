@@ -200,6 +200,12 @@ def test_modes_are_written_as_mean_and_both_ends(tmp_path):
     assert run("modes", "--count", 1, "--format", "stl", "--spacing-mm", 3, "--output", folder, "--force") == 0
 
 
+def test_modes_that_cannot_be_written_are_told_in_a_sentence(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert run("modes", "--count", 1, "--spacing-mm", 3, "--output", tmp_path / "file" / "below") == BAD_INPUT
+    assert capsys.readouterr().err.startswith("morphoflow: --output cannot be written: ")
+
+
 @pytest.mark.parametrize("words", [("--sd", 6), ("--count", 0), ("--spacing-mm", "nan"), ("--format", "nifti")])
 def test_bad_mode_options_end_with_status_2(tmp_path, words, capsys):
     assert run("modes", "--output", tmp_path / "m", *words) == BAD_INPUT
