@@ -305,10 +305,12 @@ class TestComplete:
         folder, _ = completed
         before = (folder / "run" / "completion.pt").read_bytes()
         words = ("complete", folder / "bundle", "--masks", bundle.parent / "masks", "--run", folder / "run")
-        for other in (("--steps", 21), ("--steps", 20, "--seed", 1)):
+        settings = (("--steps", 21), "other masks or settings")
+        masks = (("--steps", 20, "--seed", 1), "which the network would learn from")
+        for other, sentence in (settings, masks):
             result = run(*words, *other, "--device", "cpu")
             assert result.exit_code == 2
-            assert "other masks or settings" in result.stderr
+            assert sentence in result.stderr
         assert (folder / "run" / "completion.pt").read_bytes() == before
 
     def test_calibration_chooses_its_weight_by_validation_shapes(self, completed, run, bundle, tmp_path):
