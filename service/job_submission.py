@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from model.errors import InvalidParameter
+from model.inference.annotated_planes import check_stacks
 from model.inference.observations import AnnotatedRule, Plane
 from service.errors import Overloaded, StoreFull, UnknownJob
 from service.job_files import JobFiles
@@ -73,10 +74,8 @@ class JobDesk:
 
 def require_stacks(annotated: AnnotatedRule | Sequence[Plane], count: int) -> None:
     """Refuse planes of stacks that are not there, before anything is read: `InvalidParameter`."""
-    for position, plane in enumerate(() if isinstance(annotated, str) else annotated):
-        if plane.stack >= count:
-            part = f"annotated[{position}]"
-            raise InvalidParameter(f"{part} names stack {plane.stack}; 0 to {count - 1} is accepted", part=part)
+    if not isinstance(annotated, str):
+        check_stacks(annotated, count)
 
 
 def require_first_stack(annotated: AnnotatedRule | Sequence[Plane], archive: bytes) -> None:

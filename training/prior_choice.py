@@ -91,7 +91,7 @@ def chosen_parts(
 
 def _check_unseen(run: Path, cases: Sequence[Case]) -> None:
     values = read_record(run)[1]
-    seen = {*values["train"].values(), *values.get("voxels", ())}
+    seen = {*values["train"].values(), *values.get("voxel_digests", ())}
     names = [case.name for case in cases if not seen.isdisjoint((mask_digest(case), short_digest(case)))]
     if names:
         raise InvalidParameter(

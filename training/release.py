@@ -128,7 +128,7 @@ class Assembled:
             attribution=record["attribution"],
             accuracy={},
             files={},
-            training_masks=tuple(sorted(record.get("voxels", ()))),
+            training_masks=tuple(sorted(record.get("voxel_digests", ()))),
         )
 
     def population(self) -> Population:

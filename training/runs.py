@@ -111,7 +111,7 @@ def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
         "attribution": cohort.attribution,
         "shippable": cohort.provenance.shippable,
         "train": {case.name: mask_digest(case) for case in cohort.train},
-        "voxels": [short_digest(case) for case in cohort.train],
+        "voxel_digests": [short_digest(case) for case in cohort.train],
         "codes": copies * len(cohort.train),
         "volumes_ml": copies * [float(case.mask.sum() * np.prod(case.grid.spacing) / 1000.0) for case in cohort.train],
         "half_extent_mm": half_extent(cohort),
@@ -176,7 +176,7 @@ def _check_same(folder: Path, wanted: dict[str, Any]) -> None:
 
 def _difference(values: dict[str, Any], config: TrainingConfig, wanted: dict[str, Any]) -> str:
     """In what a record that was read differs from the one that is wanted; fields not there yet have their defaults."""
-    known = {"voxels": wanted["voxels"], **values, "config": json.loads(json.dumps(config.as_dict()))}
+    known = {"voxel_digests": wanted["voxel_digests"], **values, "config": json.loads(json.dumps(config.as_dict()))}
     return first_difference(known, json.loads(json.dumps(wanted)))
 
 

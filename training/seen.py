@@ -27,7 +27,8 @@ def check_unseen(manifest: Manifest, cases: Sequence[Case], measured: str = "val
     Raises:
         InvalidParameter: the model was trained on one of the cases.
     """
-    seen = [case.name for case in cases if _is_among(case, set(manifest.training_masks))]
+    known = set(manifest.training_masks)
+    seen = [case.name for case in cases if known and _is_among(case, known)]
     if seen:
         raise InvalidParameter(
             f"The model was trained on {listed(seen)}, which is to be among the {measured} cases; --seed and "
@@ -60,6 +61,4 @@ def listed(names: Sequence[str]) -> str:
 
 def _is_among(case: Case, digests: set[str]) -> bool:
     """With its specks, or without as masks are trained on."""
-    if not digests:
-        return False
     return short_digest(case) in digests or voxel_digest(without_specks(case.mask))[:DIGITS] in digests

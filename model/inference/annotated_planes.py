@@ -85,11 +85,22 @@ def _check_count(stacks: Sequence[MaskStack], planes: tuple[Plane, ...]) -> None
         raise InvalidMask(f"{part} holds {found}; at least two annotated planes are needed", part=part)
 
 
+def check_stacks(named: Sequence[Plane], count: int) -> None:
+    """Refuse planes of stacks that are not among so many.
+
+    Raises:
+        InvalidParameter: names the first such plane.
+    """
+    for position, plane in enumerate(named):
+        if not 0 <= plane.stack < count:
+            part = f"annotated[{position}]"
+            raise InvalidParameter(f"{part} names stack {plane.stack}; 0 to {count - 1} is accepted", part=part)
+
+
 def _named_planes(stacks: Sequence[MaskStack], named: Sequence[Plane]) -> tuple[Plane, ...]:
+    check_stacks(named, len(stacks))
     for position, plane in enumerate(named):
         part = f"annotated[{position}]"
-        if not 0 <= plane.stack < len(stacks):
-            raise InvalidParameter(f"{part} names stack {plane.stack}; 0 to {len(stacks) - 1} is accepted", part=part)
         if not 0 <= plane.axis < 3:
             raise InvalidParameter(f"{part} names axis {plane.axis}; 0 to 2 is accepted", part=part)
         size = stacks[plane.stack].grid.shape[plane.axis]

@@ -15,7 +15,7 @@ from scipy.special import expit
 from model.bundle import ShapeModel
 from model.inference.fitting import Fit
 
-#: Points evaluated in one call; bounds memory.
+#: Points evaluated in one call: bounds memory, and how long whoever wants the work ended waits.
 CHUNK = 16384
 
 
@@ -26,8 +26,10 @@ def laplace_covariance(fit: Fit) -> Float[np.ndarray, "p p"]:
 
 def model_logits(model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
     """Occupancy logits of the fitted code and pose alone at world points (mm)."""
-    parts = [model.decoder.logits(fit.latent[None], fit.pose.to_canonical(chunk)[None])[0] for chunk in _chunks(points)]
-    return np.concatenate(parts) if parts else np.zeros(0, np.float32)
+    if not len(points):
+        return np.zeros(0, np.float32)
+    parts = [model.decoder.logits(fit.latent[None], fit.pose.to_canonical(chunk)[None])[0] for chunk in chunks(points)]
+    return np.concatenate(parts)
 
 
 def fitted_logits(model: ShapeModel, fit: Fit, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
@@ -61,7 +63,7 @@ def field_derivatives(model: ShapeModel, fit: Fit, canonical: Float[np.ndarray, 
     """The fitted field and its derivatives at canonical points (mm)."""
     if not len(canonical):
         return FieldDerivatives(np.zeros(0), np.zeros((0, len(fit.precision))), np.zeros((0, 3)))
-    parts = [_derivatives(model, fit, chunk) for chunk in _chunks(canonical)]
+    parts = [_derivatives(model, fit, chunk) for chunk in chunks(canonical)]
     if len(parts) == 1:
         return parts[0]
     names = [part.name for part in fields(FieldDerivatives)]
@@ -102,8 +104,9 @@ def _held(
     return np.asarray(by_parameter - fit.discrepancy.slope * fit.discrepancy.carried(canonical))
 
 
-def _chunks(points: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "m 3"]]:
-    return [points[start : start + CHUNK] for start in range(0, len(points), CHUNK)]
+def chunks(points: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "m 3"]]:
+    """Parts of at most `CHUNK` points; one at least."""
+    return [points[start : start + CHUNK] for start in range(0, max(len(points), 1), CHUNK)]
 
 
 def logit_variance(

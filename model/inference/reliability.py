@@ -161,14 +161,15 @@ def _mean_sd(model: ShapeModel, found: Fit, points: Float[np.ndarray, "v 3"]) ->
 
 
 def highest_usual(usual: Mapping[str, float], name: str, planes: int) -> float:
-    """Highest usual value of a figure (mm) with so many planes; infinite for a model that does not say.
-
-    More planes than were measured with leave it as it is with the most.
-    """
+    """Highest usual value of a figure (mm) with so many planes; infinite for a model that does not say."""
     if f"{name}_mm" not in usual:
         return float("inf")
-    share = min(planes, MOST_USUAL_PLANES) / USUAL_PLANES
-    return float(usual[f"{name}_mm"] * share ** usual[f"{name}_exponent"])
+    return float(usual[f"{name}_mm"] * usual_share(planes) ** usual[f"{name}_exponent"])
+
+
+def usual_share(planes: int) -> float:
+    """A number of planes by `USUAL_PLANES`; more than were measured with are judged like the most."""
+    return min(planes, MOST_USUAL_PLANES) / USUAL_PLANES
 
 
 def unusual_warnings(usual: Mapping[str, float], figures: Figures) -> tuple[str, ...]:

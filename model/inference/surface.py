@@ -10,14 +10,12 @@ from model.inference.discrepancy.process import Discrepancy
 from model.inference.fitting import Fit
 from model.inference.isosurface import FieldWithGradient, extract_surface
 from model.inference.mesh import Mesh, extents, of_largest_component, subset, transformed
-from model.inference.posterior import FieldDerivatives, field_derivatives
+from model.inference.posterior import FieldDerivatives, chunks, field_derivatives
 
 #: Room around the box of all training shapes in which a surface is looked for.
 BOX_MARGIN_MM = 6.0
 #: Accepted grid steps (mm) of a surface that a caller chooses.
 SPACING_RANGE_MM = (0.25, 10.0)
-#: Points that are evaluated at a time: few enough that whoever wants the work ended waits some tenths of a second.
-POINTS_AT_A_TIME = 1 << 16
 
 
 def surface_of(
@@ -46,7 +44,7 @@ def surface_of(
         return discrepancy.corrected_with_gradient(logits, by_point, points)
 
     def gradient(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-        values, slopes = zip(*map(piece, _pieces(points)), strict=True)
+        values, slopes = zip(*map(piece, chunks(points)), strict=True)
         return np.concatenate(values), np.concatenate(slopes)
 
     return _extracted(model, latent, pose, step_mm, discrepancy, gradient, keep_specks=keep_specks)
@@ -91,18 +89,13 @@ def _extracted(
         return logits if discrepancy is None else discrepancy.corrected(logits, points)
 
     def field(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        return np.concatenate([piece(points) for points in _pieces(points)])
+        return np.concatenate([piece(chunk) for chunk in chunks(points)])
 
     mesh = extract_surface(field, -half, half, step, gradient=gradient, keep_specks=keep_specks)
     affine = np.eye(4)
     affine[:3, :3] = np.linalg.inv(pose.linear)
     affine[:3, 3] = pose.position
     return transformed(mesh, affine)
-
-
-def _pieces(points: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "m 3"]]:
-    """Equal parts of at most `POINTS_AT_A_TIME` points; one at least."""
-    return np.array_split(points, max(-(-len(points) // POINTS_AT_A_TIME), 1))
 
 
 def canonical_box(model: ShapeModel) -> Float[np.ndarray, "3"]:

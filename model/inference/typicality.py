@@ -18,7 +18,7 @@ from model.bundle import ShapeModel
 from model.inference.agreement import Section
 from model.inference.fitting import Fit
 from model.inference.mask_stack import Plane
-from model.inference.reliability import MOST_USUAL_PLANES, USUAL_PLANES, Figures
+from model.inference.reliability import MOST_USUAL_PLANES, Figures, usual_share
 
 #: Below this percentile a shape is called unlike the population; below the other when it is by the density alone.
 ATYPICAL_PERCENTILE, ATYPICAL_BY_DENSITY = 0.1, 1.0
@@ -40,8 +40,7 @@ def typicality(model: ShapeModel, found: Fit, figures: Figures) -> tuple[float, 
     if figures.planes <= MOST_USUAL_PLANES or not figures.misfit_mm > 0.0:
         tails.append(_tail(known, (known["density_mean"] - density) / known["density_sd"]))
     if figures.misfit_mm > 0.0:
-        share = min(figures.planes, MOST_USUAL_PLANES) / USUAL_PLANES
-        usual = known["misfit_mean"] + known["misfit_exponent"] * np.log(share)
+        usual = known["misfit_mean"] + known["misfit_exponent"] * np.log(usual_share(figures.planes))
         tails.append(_tail(known, (np.log(figures.misfit_mm) - usual) / known["misfit_sd"]))
     return density, 100.0 * min(1.0, len(tails) * min(tails))
 

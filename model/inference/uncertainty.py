@@ -20,6 +20,7 @@ from model.inference.member_moves import member_moves
 from model.inference.mesh import Mesh, area_cm2, area_gradient, vertex_areas, volume_ml
 from model.inference.posterior import (
     FieldDerivatives,
+    chunks,
     field_derivatives,
     fitted_jacobians,
     fitted_logits,
@@ -36,8 +37,6 @@ from model.inference.surface import canonical_box
 SATURATED_LOGIT = 12.0
 #: A field that counts distances up to some reach only is decided beyond this share of it.
 DECIDED_SHARE = 0.9
-#: Voxels evaluated at a time; bounds memory.
-VOXELS_AT_A_TIME = 1 << 15
 #: Farther than this from the fit's surface (mm) no member of an ensemble has another label.
 FAR_MM = 8.0
 
@@ -144,8 +143,7 @@ def occupancy(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndar
 
 
 def _probabilities(model: ShapeModel, state: ShapeState, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    starts = range(0, len(points), VOXELS_AT_A_TIME)
-    return np.concatenate([_piece(model, state, points[start : start + VOXELS_AT_A_TIME]) for start in starts])
+    return np.concatenate([_piece(model, state, chunk) for chunk in chunks(points)])
 
 
 def _piece(model: ShapeModel, state: ShapeState, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:

@@ -21,8 +21,9 @@ from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl
 
 from model.errors import InvalidParameter
-from model.geometry import Space, ras_to
+from model.geometry import Space
 from model.inference.mesh import Mesh, to_trimesh, transformed
+from service.adapters.image_guard import LPS_TO_RAS
 
 Writer = Callable[[Mesh, Mapping[str, str]], bytes]
 
@@ -63,7 +64,7 @@ def write_mesh(mesh: Mesh, format: str, *, space: str = "RAS", metadata: Mapping
         raise InvalidParameter("Only a surface with at least one face can be written.", part="mesh")
     frame = {"space": space, "units": UNITS}
     said = {key: _one_line(value) for key, value in {**frame, **metadata, **frame}.items()}
-    return writers[format](_placed(mesh, space), said)
+    return writers[format](transformed(mesh, LPS_TO_RAS) if space == "LPS" else mesh, said)
 
 
 def colours(values: Float[np.ndarray, "v"]) -> UInt8[np.ndarray, "v 4"]:
@@ -80,12 +81,6 @@ def colour_range(values: Float[np.ndarray, "v"]) -> tuple[float, float]:
     """Scalars at the first and the last colour of the ramp."""
     top = float(np.abs(values).max())
     return (-top if (values < 0).any() else 0.0), top
-
-
-def _placed(mesh: Mesh, space: str) -> Mesh:
-    turn = np.eye(4)
-    turn[:3, :3] = ras_to("LPS")
-    return transformed(mesh, turn) if space == "LPS" else mesh
 
 
 def _writers() -> dict[str, Writer]:

@@ -89,7 +89,7 @@ def test_a_run_that_recorded_no_voxels_is_continued(tmp_path):
     )
     prepare(cohort(CASES[:3]), config, tmp_path)
     values = json.loads((tmp_path / RECORD).read_text(encoding="utf-8"))
-    assert values.pop("voxels") == [short_digest(case) for case in CASES[:3]]
+    assert values.pop("voxel_digests") == [short_digest(case) for case in CASES[:3]]
     (tmp_path / RECORD).write_text(json.dumps(values), encoding="utf-8")
     prepare(cohort(CASES[:3]), config, tmp_path, resume=True)
-    assert record(cohort(CASES[:3]), config)["voxels"]
+    assert record(cohort(CASES[:3]), config)["voxel_digests"]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.geometry import Pose
-from model.inference import surface
+from model.inference import posterior
 from model.inference.mesh import area_cm2, extents, is_watertight, volume_ml
 from model.inference.posterior import fitted_jacobians
 from model.inference.surface import BOX_MARGIN_MM, canonical_box, covering_grid, differentiated_surface, surface_of
@@ -162,7 +162,7 @@ def test_what_ends_the_work_is_asked_after_every_few_points(monkeypatch):
     model = interruptible(MODEL, lambda: told.append(None))
     whole = surface_of(model, LATENT, POSE)
     few = len(told)
-    monkeypatch.setattr(surface, "POINTS_AT_A_TIME", 100)
+    monkeypatch.setattr(posterior, "CHUNK", 100)
     pieces = surface_of(model, LATENT, POSE)
     assert len(told) - few > len(pieces.vertices) / 100
     np.testing.assert_array_equal(pieces.faces, whole.faces)

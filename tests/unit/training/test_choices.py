@@ -1,0 +1,52 @@
+"""What the options of the commands become."""
+
+import pytest
+
+from training.choices import DeviceName, ObjectiveName, RegimeName, configured, with_batches, with_duration
+from training.config import TrainingConfig
+
+
+def built(objective=ObjectiveName.VARIATIONAL, flow=True, ard=True, **more):
+    return configured(
+        objective, RegimeName.THICK, 16, flow=flow, ard=ard, reflected=True, seed=3, device=DeviceName.CPU, **more
+    )
+
+
+def test_options_reach_the_configuration():
+    config = built(flow=False, ard=False)
+    assert (config.regime, config.seed, config.device) == ("thick", 3, "cpu")
+    assert config.decoder.latent_size == config.prior.flow.latent_size == 16
+    assert not config.prior.use_flow
+    assert not config.prior.use_ard
+
+
+@pytest.mark.parametrize("objective", list(ObjectiveName))
+def test_the_weight_of_relevance_determination_is_a_choice(objective):
+    assert built(objective, ard_weight=7e-5).objective.lambda_ard == 7e-5
+    assert built(objective).objective.lambda_ard == 1e-4
+
+
+def test_the_paper_is_selectable_as_written():
+    config = built(ObjectiveName.PAPER)
+    assert (config.objective.name, config.objective.reconstruction) == ("paper", "dice")
+    assert config.batch_shapes == 6
+    assert not config.prior.standardise
+    assert not config.decoder.unit_columns
+
+
+@pytest.mark.parametrize(("shapes", "batch", "points"), [(15, 32, 256), (286, 71, 115), (5000, 128, 64)])
+def test_large_cohorts_have_more_shapes_and_fewer_points_in_a_step(shapes, batch, points):
+    config = with_batches(TrainingConfig(), shapes)
+    assert config.batch_shapes == batch
+    assert points - 2 <= config.near_points + config.far_points <= points
+
+
+def test_the_papers_batches_stay():
+    config = built(ObjectiveName.PAPER)
+    assert with_batches(config, 5000) == config
+
+
+@pytest.mark.parametrize(("shapes", "batch", "steps"), [(12, 6, 30), (13, 6, 45), (4, 6, 15)])
+def test_an_epoch_sees_every_shape(shapes, batch, steps):
+    config = with_duration(TrainingConfig(batch_shapes=batch), None, 15, shapes)
+    assert config.steps == steps
