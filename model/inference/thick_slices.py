@@ -28,7 +28,7 @@ def through_thickness(
     model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations, options: FitOptions
 ) -> tuple[Fit, Observations]:
     """The fit to observations placed at the medians of their columns; unchanged where no slice is thick."""
-    columns = columns_of(stacks, observations)
+    columns = columns_of(stacks, observations.planes)[observations.plane_of]
     if not columns.any():
         return found, observations
     placed = observations
@@ -38,17 +38,21 @@ def through_thickness(
     return found, placed
 
 
-def columns_of(stacks: Sequence[MaskStack], observations: Observations) -> Float[np.ndarray, "n 3"]:
-    """Vector (world mm) through the slice of each observation, zero where it is not thick."""
-    vectors = np.array([_through(stacks[plane.stack], plane) for plane in observations.planes]).reshape(-1, 3)
-    return np.asarray(vectors[observations.plane_of])
+def columns_of(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> Float[np.ndarray, "k 3"]:
+    """Vector (world mm) through each slice, zero where it is not thick."""
+    return np.array([_through(stacks[plane.stack], plane) for plane in planes]).reshape(-1, 3)
+
+
+def along(points: Float[np.ndarray, "n 3"], columns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "5 n 3"]:
+    """Places through the thickness at each point (world mm)."""
+    return np.stack([points + share * columns for share in PLACES])
 
 
 def at_medians(
     model: ShapeModel, found: Fit, observations: Observations, columns: Float[np.ndarray, "n 3"]
 ) -> Observations:
     """Observations moved to where the fitted field takes its median through the slice."""
-    moved = np.stack([observations.points + share * columns for share in PLACES])
+    moved = along(observations.points, columns)
     logits = model_logits(model, found, moved.reshape(-1, 3)).reshape(moved.shape[:2])
     median = np.argsort(logits, axis=0, kind="stable")[len(PLACES) // 2]
     return replace(observations, points=moved[median, np.arange(len(median))])

@@ -20,6 +20,7 @@ from model.inference.objective import Place
 from model.inference.observations import Observations
 from model.inference.posterior import model_logits
 from model.inference.surface import canonical_box
+from model.inference.thick_slices import along, columns_of
 
 #: Points of a contour this close together (mm) are taken together.
 CELL_MM = 1.5
@@ -30,6 +31,8 @@ MOST_POINTS, CLOSEST_MM = 900, 0.3
 CLEARLY_WRONG_MM = 1.5
 #: Planes are kept this far apart (mm) when distances within them are looked up.
 APART_MM = 1e4
+#: How much the median through a thick slice counts beside the middle, as where a contour of it runs.
+MEDIAN_SHARE = 0.5
 #: SD of the observations that no fidelity goes below (mm): half a voxel's quantisation.
 LEAST_NOISE_MM = 0.1
 
@@ -95,7 +98,8 @@ def discrepancy_of(
     """The discrepancy given the drawn contours; None where the model alone is trusted or nothing was drawn.
 
     Observed are contour points (the surface runs there) and observations far on the wrong side of the fitted surface
-    (it is elsewhere). Planes that the fit left out are left out.
+    (it is elsewhere). On a thick slice that is told of a level half-way between the one at the slice's centre and the
+    median through its thickness. Planes that the fit left out are left out.
     """
     if prior.fidelity <= 0.0:
         return None
@@ -108,10 +112,12 @@ def discrepancy_of(
     )
     slope = float(np.median(np.linalg.norm(by_point, axis=1)))
     levels = Levels(slope, completed(model, found, stacks, observations, slope))
+    level = levels.at(logits, canonical)
+    level += MEDIAN_SHARE * (_medians(model, found, levels, seen, level) - level)
     by_parameter = np.concatenate([by_latent, found.pose.jacobian(canonical, by_point)], axis=1)
     return Discrepancy(
         points=canonical,
-        residuals=saturated(seen.distances * np.exp(found.pose.log_scale)) - levels.at(logits, canonical),
+        residuals=saturated(seen.distances * np.exp(found.pose.log_scale)) - level,
         jacobian=by_parameter * levels.by_logit(logits)[:, None],
         covariance=prior.covariance,
         noise_mm=prior.noise_mm,
@@ -137,15 +143,38 @@ def observed_anew(model: ShapeModel, found: Fit, places: Sequence[Place]) -> lis
 
 @dataclass(frozen=True)
 class _Evidence:
-    """World points and their signed distances from the drawn contour (world mm, positive inside; 0 on it)."""
+    """Points (world mm) and what is known of each.
+
+    Attributes:
+        distances: signed, from the drawn contour (world mm, positive inside; 0 on it).
+        columns: the vector through the slice where that is thick (world mm; 0 elsewhere).
+    """
 
     points: Float[np.ndarray, "n 3"]
     distances: Float[np.ndarray, "n"]
+    columns: Float[np.ndarray, "n 3"]
+
+    def __getitem__(self, chosen: Int[np.ndarray, "m"] | Bool[np.ndarray, "n"]) -> "_Evidence":
+        return _Evidence(self.points[chosen], self.distances[chosen], self.columns[chosen])
 
 
 def _within(evidence: _Evidence, found: Fit, half: Float[np.ndarray, "3"]) -> _Evidence:
-    inside = (np.abs(found.pose.to_canonical(evidence.points)) <= half).all(axis=1)
-    return _Evidence(evidence.points[inside], evidence.distances[inside])
+    return evidence[(np.abs(found.pose.to_canonical(evidence.points)) <= half).all(axis=1)]
+
+
+def _medians(
+    model: ShapeModel, found: Fit, levels: Levels, seen: _Evidence, at_centres: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n"]:
+    """Median distance (mm) from the fitted surface through the slice at each point; as it is where that is thin."""
+    thick = seen.columns.any(axis=1)
+    if not thick.any():
+        return at_centres
+    places = along(seen.points[thick], seen.columns[thick])
+    world = places.reshape(-1, 3)
+    through = levels.at(model_logits(model, found, world), found.pose.to_canonical(world)).reshape(places.shape[:2])
+    result = at_centres.copy()
+    result[thick] = np.median(through, axis=0)
+    return result
 
 
 def _evidence(model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observations: Observations) -> _Evidence:
@@ -154,16 +183,20 @@ def _evidence(model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observ
     contour, plane_of = contour_points(stacks, observations.planes)
     used = trusted[plane_of]
     contour, plane_of = contour[used], plane_of[used]
-    wrong = _wrong_side(model, found, observations, trusted, contour, plane_of)
+    columns = columns_of(stacks, observations.planes)
+    wrong = _wrong_side(model, found, observations, trusted, contour, plane_of, columns)
     points = np.concatenate([contour, wrong.points])
     if not len(points):
         return wrong
     kinds = np.concatenate([plane_of + 1, np.zeros(len(wrong.distances), int)])
     cells = cells_of(found.pose.to_canonical(points), CELL_MM, kinds)
     distances = np.concatenate([np.zeros(len(contour)), wrong.distances])
-    means = _Evidence(means_of(cells, points), means_of(cells, distances[:, None])[:, 0])
-    chosen = _spread_out(found.pose.to_canonical(means.points), means.distances != 0.0)
-    return _Evidence(means.points[chosen], means.distances[chosen])
+    means = _Evidence(
+        means_of(cells, points),
+        means_of(cells, distances[:, None])[:, 0],
+        means_of(cells, np.concatenate([columns[plane_of], wrong.columns])),
+    )
+    return means[_spread_out(found.pose.to_canonical(means.points), means.distances != 0.0)]
 
 
 def _wrong_side(
@@ -173,6 +206,7 @@ def _wrong_side(
     trusted: Bool[np.ndarray, "k"],
     contour: Float[np.ndarray, "n 3"],
     plane_of: Int[np.ndarray, "n"],
+    columns: Float[np.ndarray, "k 3"],
 ) -> _Evidence:
     """Observations that the fit has on the wrong side of its surface, clearly so by their distance in the plane."""
     inside = observations.labels > 0
@@ -180,13 +214,14 @@ def _wrong_side(
         ((model_logits(model, found, observations.points) > 0) != inside) & trusted[observations.plane_of]
     )
     if not (wrong.size and len(contour)):
-        return _Evidence(np.zeros((0, 3)), np.zeros(0))
+        return _Evidence(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)))
     apart = APART_MM * plane_of[:, None], APART_MM * observations.plane_of[wrong][:, None]
     tree = cKDTree(np.hstack([contour, apart[0]]))
     distance = np.asarray(tree.query(np.hstack([observations.points[wrong], apart[1]]))[0])
     clear = (distance > CLEARLY_WRONG_MM) & (distance < APART_MM)
     chosen = wrong[clear]
-    return _Evidence(observations.points[chosen], np.where(inside[chosen], distance[clear], -distance[clear]))
+    distances = np.where(inside[chosen], distance[clear], -distance[clear])
+    return _Evidence(observations.points[chosen], distances, columns[observations.plane_of[chosen]])
 
 
 def _spread_out(points: Float[np.ndarray, "n 3"], kinds: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from model.geometry import Grid
+from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_of
 from model.inference.fitting import FitOptions, fit
 from model.inference.observations import MaskStack, find_planes, observe
 from model.inference.reconstruction import Options, reconstruct
 from model.inference.thick_slices import at_medians, columns_of, through_thickness
-from tests.analytic_model import ellipsoid_model
+from tests.analytic_model import MEAN_AXES, SPREAD, ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import PARALLEL, cube_around, drawn
 
@@ -34,17 +35,22 @@ def observed(stack):
     return observe([stack], find_planes([stack], "nonempty"), budget=2500, seed=0)
 
 
+def true_fit(observations):
+    found = fit(MODEL, observations, OPTIONS)
+    pose = replace(found.pose, position=CENTRE, rotation=np.eye(3), log_scale=0.0)
+    return replace(found, latent=np.log(np.divide(TRUTH.semi_axes, MEAN_AXES)) / SPREAD, pose=pose)
+
+
 def semi_axes(found):
     return MODEL.decoder.axes(found.latent[None])[0] * np.exp(-found.pose.log_scale)
 
 
 def test_columns_are_the_thickness_of_thick_slices_alone():
     stack = thick_stack()
-    np.testing.assert_allclose(
-        columns_of([stack], observed(stack)), np.tile([0.0, 0.0, 5.0], (2500, 1))[: len(observed(stack).points)]
-    )
+    planes = find_planes([stack], "nonempty")
+    np.testing.assert_allclose(columns_of([stack], planes), np.tile([0.0, 0.0, 5.0], (len(planes), 1)))
     thin = drawn(TRUTH, cube_around(CENTRE), PARALLEL)
-    assert not columns_of([thin], observe([thin], find_planes([thin], PARALLEL), budget=2500, seed=0)).any()
+    assert not columns_of([thin], find_planes([thin], PARALLEL)).any()
 
 
 def test_thin_slices_are_left_as_they_are():
@@ -58,7 +64,7 @@ def test_an_observation_stands_where_the_field_takes_its_median():
     stack = thick_stack()
     observations = observed(stack)
     found = fit(MODEL, observations, OPTIONS)
-    columns = columns_of([stack], observations)
+    columns = columns_of([stack], observations.planes)[observations.plane_of]
     moved = at_medians(MODEL, found, observations, columns)
     shares = (moved.points - observations.points)[:, 2] / THICKNESS
     assert set(np.round(shares, 6)) <= {-0.4, -0.2, 0.0, 0.2, 0.4}
@@ -74,6 +80,27 @@ def test_the_majority_tells_the_shape_better_than_the_centre():
     settled, _ = through_thickness(MODEL, centred, [stack], observations, OPTIONS)
     errors = [np.abs(semi_axes(found) - TRUTH.semi_axes).sum() for found in (centred, settled)]
     assert errors[1] <= errors[0] + 0.05
+
+
+def test_contours_of_thick_slices_ask_little_of_the_shape_that_was_drawn():
+    """The whole object fills half of a slice's thickness elsewhere than its section at the slice's centre ends."""
+    stack = thick_stack()
+    observations = observed(stack)
+    truth = true_fit(observations)
+    made = discrepancy_of(MODEL, truth, [stack], observations, DiscrepancyPrior())
+    logits = MODEL.decoder.logits(truth.latent[None], made.points[None])[0]
+    at_centres = -made.levels.at(logits, made.points)
+    assert abs(made.residuals.mean()) < 0.75 * abs(at_centres.mean())
+    assert np.square(made.residuals).mean() < 0.8 * np.square(at_centres).mean()
+
+
+def test_contours_of_thin_slices_run_in_them():
+    stack = drawn(TRUTH, cube_around(CENTRE), PARALLEL)
+    observations = observe([stack], find_planes([stack], PARALLEL), budget=2500, seed=0)
+    truth = true_fit(observations)
+    made = discrepancy_of(MODEL, truth, [stack], observations, DiscrepancyPrior())
+    logits = MODEL.decoder.logits(truth.latent[None], made.points[None])[0]
+    np.testing.assert_array_equal(made.residuals, -made.levels.at(logits, made.points))
 
 
 def test_planes_that_were_left_out_stay_out():
