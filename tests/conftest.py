@@ -1,6 +1,8 @@
 """What all tests share: annotations checked at run time, real cohorts where they are, Hypothesis profiles."""
 
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,14 @@ settings.load_profile("ci" if os.environ.get("CI") else "local")
 def repository() -> Path:
     """Root of the checkout."""
     return ROOT
+
+
+@pytest.fixture
+def keyboard() -> Iterator[None]:
+    """Interrupts raise, as at a terminal; what is started in the background has them ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,9 @@ from scipy.spatial import cKDTree
 
 from model.inference.mesh import Mesh
 
+#: Determinants below this share of the product of their columns' lengths are zero but for rounding.
+ROUNDING = 1e-13
+
 
 def intersecting_pairs(mesh: Mesh) -> int:
     """How many pairs of faces have an edge of one through the inside of the other, or lie on each other.
@@ -37,7 +40,8 @@ def _pierced(mesh: Mesh, start: np.ndarray, end: np.ndarray, face: np.ndarray) -
     a, b, c = np.moveaxis(mesh.vertices[faces], 1, 0)
     h = np.cross(way, c - a)
     det = np.einsum("ij,ij->i", b - a, h)
-    scale = np.where(np.abs(det) < 1e-14, np.nan, det)
+    size = np.linalg.norm(way, axis=1) * np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
+    scale = np.where(np.abs(det) <= ROUNDING * size, np.nan, det)
     s = origin - a
     u = np.einsum("ij,ij->i", s, h) / scale
     q = np.cross(s, b - a)

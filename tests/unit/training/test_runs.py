@@ -56,6 +56,7 @@ def test_an_interrupted_run_ends_as_an_unbroken_one(tmp_path):
         assert torch.equal(value, resumed.state_dict()[name]), name
 
 
+@pytest.mark.usefixtures("keyboard")
 def test_an_interrupt_from_the_keyboard_loses_no_step(tmp_path):
     def interrupt(step, _figures):
         if step == 3:

@@ -95,6 +95,25 @@ def test_vertices_moved_onto_the_surface_do_not_pierce_it(field, step):
         assert intersecting_pairs(mesh) == 0
 
 
+def test_faces_in_one_plane_that_only_touch_are_no_pair():
+    """Slivers at the edge of a plate, where a determinant was 1.2e-14 and not zero."""
+    turn = np.array(
+        [
+            [-0.2793053119426367, -0.5821458232630243, -0.7636064321219681],
+            [0.7769262357405557, -0.6043325840526335, 0.17654390975130496],
+            [-0.5642465480077273, -0.543956219111136, 0.6210776640257489],
+        ]
+    )
+    plate = Box((8.0, 6.0, 0.5625)).logits
+
+    def field(points):
+        return plate((points - 0.3) @ turn)
+
+    mesh = extract_surface(field, LOW, HIGH, 0.7, gradient=lambda p: slopes_of(field, p), keep_specks=True)
+    assert is_watertight(mesh)
+    assert intersecting_pairs(mesh) == 0
+
+
 def test_samples_of_shipped_models_do_not_pierce_themselves(shipped_bundles):
     for folder in shipped_bundles:
         model = open_bundle(folder, threads=1)

@@ -72,6 +72,7 @@ def test_a_training_that_was_ended_goes_on_to_the_same_network(tmp_path):
         torch.testing.assert_close(resumed.state_dict()[name], value, rtol=0.0, atol=0.0)
 
 
+@pytest.mark.usefixtures("keyboard")
 def test_an_interrupt_from_the_keyboard_loses_no_step(tmp_path):
     config = replace(CONFIG, steps=3, width=4, batch=1)
 
