@@ -1,12 +1,11 @@
 """Pairs of triangles of a mesh that pierce each other, found without the code that made the mesh."""
 
+from fractions import Fraction
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from model.inference.mesh import Mesh
-
-#: Determinants below this share of the product of their columns' lengths are zero but for rounding.
-ROUNDING = 1e-13
 
 
 def intersecting_pairs(mesh: Mesh) -> int:
@@ -40,14 +39,30 @@ def _pierced(mesh: Mesh, start: np.ndarray, end: np.ndarray, face: np.ndarray) -
     a, b, c = np.moveaxis(mesh.vertices[faces], 1, 0)
     h = np.cross(way, c - a)
     det = np.einsum("ij,ij->i", b - a, h)
-    size = np.linalg.norm(way, axis=1) * np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
-    scale = np.where(np.abs(det) <= ROUNDING * size, np.nan, det)
+    scale = np.where(det == 0.0, np.nan, det)
     s = origin - a
     u = np.einsum("ij,ij->i", s, h) / scale
     q = np.cross(s, b - a)
     v = np.einsum("ij,ij->i", way, q) / scale
     t = np.einsum("ij,ij->i", c - a, q) / scale
-    return apart & (u > 0) & (v > 0) & (u + v < 1) & (t > 0) & (t < 1)
+    result = np.asarray(apart & (u > 0) & (v > 0) & (u + v < 1) & (t > 0) & (t < 1))
+    for row in np.flatnonzero(result):
+        result[row] = _pierces(mesh.vertices[start[row]], mesh.vertices[end[row]], *mesh.vertices[faces[row]])
+    return result
+
+
+def _pierces(p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> bool:
+    """The same of one segment and one face in exact arithmetic: small determinants are often rounding alone."""
+    p, q, a, b, c = ([Fraction(float(value)) for value in point] for point in (p, q, a, b, c))
+    sides = _volume(p, a, b, c), _volume(q, a, b, c)
+    around = _volume(p, q, a, b), _volume(p, q, b, c), _volume(p, q, c, a)
+    return sides[0] * sides[1] < 0 and (min(around) > 0 or max(around) < 0)
+
+
+def _volume(a: list[Fraction], b: list[Fraction], c: list[Fraction], d: list[Fraction]) -> Fraction:
+    """Six times the signed volume of a tetrahedron."""
+    x, y, z = ([one - other for one, other in zip(corner, a, strict=True)] for corner in (b, c, d))
+    return x[0] * (y[1] * z[2] - y[2] * z[1]) - x[1] * (y[0] * z[2] - y[2] * z[0]) + x[2] * (y[0] * z[1] - y[1] * z[0])
 
 
 def _folded(mesh: Mesh, one: np.ndarray, other: np.ndarray) -> np.ndarray:

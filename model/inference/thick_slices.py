@@ -43,7 +43,7 @@ def columns_of(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> Float[np
     return np.array([_through(stacks[plane.stack], plane) for plane in planes]).reshape(-1, 3)
 
 
-def along(points: Float[np.ndarray, "n 3"], columns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "5 n 3"]:
+def along(points: Float[np.ndarray, "n 3"], columns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k n 3"]:
     """Places through the thickness at each point (world mm)."""
     return np.stack([points + share * columns for share in PLACES])
 

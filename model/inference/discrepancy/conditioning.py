@@ -31,7 +31,7 @@ MOST_POINTS, CLOSEST_MM = 900, 0.3
 CLEARLY_WRONG_MM = 1.5
 #: Planes are kept this far apart (mm) when distances within them are looked up.
 APART_MM = 1e4
-#: How much the median through a thick slice counts beside the middle, as where a contour of it runs.
+#: Weight of the median level through a thick slice beside the level at its centre, in what its contours are told of.
 MEDIAN_SHARE = 0.5
 #: SD of the observations that no fidelity goes below (mm): half a voxel's quantisation.
 LEAST_NOISE_MM = 0.1
@@ -112,8 +112,7 @@ def discrepancy_of(
     )
     slope = float(np.median(np.linalg.norm(by_point, axis=1)))
     levels = Levels(slope, completed(model, found, stacks, observations, slope))
-    level = levels.at(logits, canonical)
-    level += MEDIAN_SHARE * (_medians(model, found, levels, seen, level) - level)
+    level = _told_of(model, found, levels, seen, levels.at(logits, canonical))
     by_parameter = np.concatenate([by_latent, found.pose.jacobian(canonical, by_point)], axis=1)
     return Discrepancy(
         points=canonical,
@@ -162,10 +161,10 @@ def _within(evidence: _Evidence, found: Fit, half: Float[np.ndarray, "3"]) -> _E
     return evidence[(np.abs(found.pose.to_canonical(evidence.points)) <= half).all(axis=1)]
 
 
-def _medians(
+def _told_of(
     model: ShapeModel, found: Fit, levels: Levels, seen: _Evidence, at_centres: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
-    """Median distance (mm) from the fitted surface through the slice at each point; as it is where that is thin."""
+    """Distance from the fitted surface (mm) that is observed at each point: that there, on thin slices."""
     thick = seen.columns.any(axis=1)
     if not thick.any():
         return at_centres
@@ -173,7 +172,7 @@ def _medians(
     world = places.reshape(-1, 3)
     through = levels.at(model_logits(model, found, world), found.pose.to_canonical(world)).reshape(places.shape[:2])
     result = at_centres.copy()
-    result[thick] = np.median(through, axis=0)
+    result[thick] += MEDIAN_SHARE * (np.median(through, axis=0) - result[thick])
     return result
 
 
@@ -183,18 +182,21 @@ def _evidence(model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observ
     contour, plane_of = contour_points(stacks, observations.planes)
     used = trusted[plane_of]
     contour, plane_of = contour[used], plane_of[used]
+    wrong, distances = _wrong_side(model, found, observations, trusted, contour, plane_of)
     columns = columns_of(stacks, observations.planes)
-    wrong = _wrong_side(model, found, observations, trusted, contour, plane_of, columns)
-    points = np.concatenate([contour, wrong.points])
-    if not len(points):
-        return wrong
-    kinds = np.concatenate([plane_of + 1, np.zeros(len(wrong.distances), int)])
-    cells = cells_of(found.pose.to_canonical(points), CELL_MM, kinds)
-    distances = np.concatenate([np.zeros(len(contour)), wrong.distances])
+    whole = _Evidence(
+        np.concatenate([contour, observations.points[wrong]]),
+        np.concatenate([np.zeros(len(contour)), distances]),
+        np.concatenate([columns[plane_of], columns[observations.plane_of[wrong]]]),
+    )
+    if not len(whole.points):
+        return whole
+    kinds = np.concatenate([plane_of + 1, np.zeros(len(wrong), int)])
+    cells = cells_of(found.pose.to_canonical(whole.points), CELL_MM, kinds)
     means = _Evidence(
-        means_of(cells, points),
-        means_of(cells, distances[:, None])[:, 0],
-        means_of(cells, np.concatenate([columns[plane_of], wrong.columns])),
+        means_of(cells, whole.points),
+        means_of(cells, whole.distances[:, None])[:, 0],
+        means_of(cells, whole.columns),
     )
     return means[_spread_out(found.pose.to_canonical(means.points), means.distances != 0.0)]
 
@@ -206,22 +208,24 @@ def _wrong_side(
     trusted: Bool[np.ndarray, "k"],
     contour: Float[np.ndarray, "n 3"],
     plane_of: Int[np.ndarray, "n"],
-    columns: Float[np.ndarray, "k 3"],
-) -> _Evidence:
-    """Observations that the fit has on the wrong side of its surface, clearly so by their distance in the plane."""
+) -> tuple[Int[np.ndarray, "m"], Float[np.ndarray, "m"]]:
+    """Numbers of observations that the fit has clearly on the wrong side of its surface.
+
+    Returns:
+        The numbers, and signed distances from the drawn contour in the plane (world mm, positive inside).
+    """
     inside = observations.labels > 0
     wrong = np.flatnonzero(
         ((model_logits(model, found, observations.points) > 0) != inside) & trusted[observations.plane_of]
     )
     if not (wrong.size and len(contour)):
-        return _Evidence(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)))
+        return np.zeros(0, int), np.zeros(0)
     apart = APART_MM * plane_of[:, None], APART_MM * observations.plane_of[wrong][:, None]
     tree = cKDTree(np.hstack([contour, apart[0]]))
     distance = np.asarray(tree.query(np.hstack([observations.points[wrong], apart[1]]))[0])
     clear = (distance > CLEARLY_WRONG_MM) & (distance < APART_MM)
     chosen = wrong[clear]
-    distances = np.where(inside[chosen], distance[clear], -distance[clear])
-    return _Evidence(observations.points[chosen], distances, columns[observations.plane_of[chosen]])
+    return chosen, np.where(inside[chosen], distance[clear], -distance[clear])
 
 
 def _spread_out(points: Float[np.ndarray, "n 3"], kinds: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:

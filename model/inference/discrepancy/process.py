@@ -45,7 +45,7 @@ class Discrepancy:
     Attributes:
         points: (n, 3) canonical mm.
         residuals: (n,) what the process was observed to be there (mm).
-        jacobian: (n, p) derivatives of ``m`` by (latent, pose step) there.
+        jacobian: (n, p) derivatives of ``m`` by (latent, pose step) there; on a thick slice, at its centre.
         covariance: of the process before it saw the contours (mm^2).
         noise_mm: SD of the observations.
         levels: ``m``.
