@@ -21,6 +21,7 @@ from model.backends import (
 )
 from model.errors import BundleCorrupt, BundleIncomplete, BundleTooNew, InvalidParameter
 from model.geometry import CanonicalLattice
+from model.manifest_values import check_values
 
 BackendName = Literal["onnx", "torchscript"]
 #: Format of the bundles that this program writes, and the newest that it reads.
@@ -150,7 +151,8 @@ def open_bundle(folder: Path, *, backend: BackendName = "onnx", threads: int | N
     load = {"onnx": load_onnx, "torchscript": load_torchscript}[backend]
     decoder, prior = load(folder, manifest.latent_size, threads)
     completer = _completer(folder, manifest, backend, threads)
-    return ShapeModel(manifest, digest, _read_population(folder / POPULATION), decoder, prior, completer)
+    population = _read_population(folder / POPULATION, manifest.latent_size)
+    return ShapeModel(manifest, digest, population, decoder, prior, completer)
 
 
 def _completer(folder: Path, manifest: Manifest, backend: BackendName, threads: int | None) -> Completer | None:
@@ -234,6 +236,7 @@ def _manifest_of(values: dict[str, Any]) -> Manifest:
     unlisted = [name for name in REQUIRED_FILES if name not in files]
     if unlisted:
         raise BundleIncomplete(f"{MANIFEST} lists no {', '.join(unlisted)}; export the model anew.")
+    check_values(values)
     return Manifest(**values)
 
 
@@ -263,6 +266,12 @@ def _check_file(path: Path, expected: str) -> None:
         raise BundleCorrupt(f"{path.name} differs from the SHA-256 in the manifest; export or copy the bundle anew.")
 
 
-def _read_population(path: Path) -> Population:
+def _read_population(path: Path, latent_size: int) -> Population:
     with np.load(path, allow_pickle=False) as stored:
-        return Population(**{f.name: stored[f.name] for f in fields(Population)})
+        missing = [f.name for f in fields(Population) if f.name not in stored]
+        if missing:
+            raise BundleCorrupt(f"{path.name} lacks {', '.join(missing)}; export the model anew.")
+        population = Population(**{f.name: stored[f.name] for f in fields(Population)})
+    if population.codes.shape[1:] != (latent_size,) or population.base_codes.shape != population.codes.shape:
+        raise BundleCorrupt(f"{path.name} holds codes of another size than the manifest's latent_size {latent_size}.")
+    return population

@@ -28,7 +28,8 @@ def find_planes(
 
     ``all`` takes every plane along the axis of the largest spacing, ``nonempty`` those of them that hold
     foreground, ``auto`` the fewest planes along any axes that together hold all foreground
-    (`model.inference.plane_cover`). Each stack is judged by itself; planes are counted over all of them.
+    (`model.inference.plane_cover`). A stack of a single slice has that one alone. Each stack is judged by itself;
+    planes are counted over all of them.
     Planes without foreground are annotated by ``all`` and by name only: between two drawn slices of a
     sparse stack nobody has looked.
 
@@ -60,6 +61,9 @@ def find_planes(
 
 
 def _planes_by_rule(stack: MaskStack, rule: AnnotatedRule) -> list[tuple[int, int]]:
+    flat = [axis for axis, size in enumerate(stack.grid.shape) if size == 1]
+    if len(flat) == 1:
+        return [(flat[0], 0)]
     drawn = stack.foreground & ~stack.excluded
     if rule == "auto":
         return cover_planes(drawn)
@@ -119,17 +123,18 @@ def _named_planes(stacks: Sequence[MaskStack], named: Sequence[Plane]) -> tuple[
 def _check_same_world(stacks: Sequence[MaskStack], gap_mm: float) -> None:
     """Every stack must be near another, and through such neighbours near all: many series may hold a slice each."""
     boxes = [world_box(stack.grid, *index_box(stack.foreground)) for stack in stacks]
-    reached, left = [0], list(range(1, len(stacks)))
-    while left:
-        gap, first, second = min((_gap(boxes[a], boxes[b]), a, b) for a in reached for b in left)
+    nearest = {number: (_gap(boxes[0], boxes[number]), 0) for number in range(1, len(stacks))}
+    while nearest:
+        second = min(nearest, key=lambda number: (*nearest[number], number))
+        gap, first = nearest.pop(second)
         if gap > gap_mm:
             raise InconsistentStacks(
                 f"{stacks[first].part} and {stacks[second].part} lie {gap:.0f} mm apart in the world, too far for one "
                 "object; stacks of one object in one frame are accepted",
                 part=stacks[second].part,
             )
-        reached.append(second)
-        left.remove(second)
+        for number, known in nearest.items():
+            nearest[number] = min(known, (_gap(boxes[second], boxes[number]), second))
 
 
 def _gap(

@@ -86,6 +86,7 @@ class Fit:
         doubted: number of a plane that stands out from the others, though too little to be left out, or None.
         rival: another optimum, of those that starts led to, that the drawing hardly tells from this one; None without.
         discrepancy: what the drawn contours show and the code cannot express; None when it was not asked for.
+        trust: share of the model's likelihood precision that the drawing was given; below 1 for a rough one.
     """
 
     latent: Float[np.ndarray, "d"]
@@ -99,3 +100,4 @@ class Fit:
     doubted: int | None = None
     rival: Rival | None = None
     discrepancy: Discrepancy | None = None
+    trust: float = 1.0

@@ -86,8 +86,8 @@ class Verdict:
 
 
 def most_wrong(observations: Observations) -> int:
-    """How many planes may be left out at most."""
-    planes = np.unique(observations.plane_of[observations.weights > 0])
+    """How many planes may be left out at most: a share of those that show the object, which empty ones do not judge."""
+    planes = np.unique(observations.plane_of[(observations.weights > 0) & (observations.labels > 0)])
     return len(planes) // PLANES_PER_WRONG if len(planes) >= FEWEST_JUDGED else 0
 
 

@@ -215,7 +215,8 @@ class Judge:
 
     def _informed(self, curve: SectionCurve, places: _Places) -> Float[np.ndarray, "p p"]:
         """Covariance of code and pose after the plane, by the matrix inversion lemma."""
-        worth = self._model.manifest.likelihood_precision * curve.lengths / np.maximum(places.steepness, 1e-6)
+        precision = self._found.trust * self._model.manifest.likelihood_precision
+        worth = precision * curve.lengths / np.maximum(places.steepness, 1e-6)
         seen = np.sqrt(worth)[:, None] * places.by_parameter
         crossed = seen @ self._covariance
         gram = np.eye(len(seen)) + crossed @ seen.T

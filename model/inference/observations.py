@@ -96,8 +96,9 @@ def observe(
     not excluded, in each stack's smallest index window around the box of all foreground grown by
     `COVER_MARGIN_MM`. A voxel where two planes cross is used once, for the plane in whose section it is
     nearer to the contour (the finer plane, when equally near). A band larger than the budget less
-    `COVER_SHARE` is sampled in the same way. Dense volumes, whose sections have over `CANDIDATE_LIMIT` voxels,
-    are seen on every second, third, ... plane, and each of those stands for as many.
+    `COVER_SHARE` is sampled in the same way. Of dense volumes, whose sections have over `CANDIDATE_LIMIT` voxels,
+    every second, third, ... plane is seen, and each of those stands for as many. Planes that show the object and
+    empty ones are thinned out each by themselves, so that few drawn ones among many empty ones are all seen.
 
     Args:
         planes: as `find_planes` returns them.
@@ -114,8 +115,8 @@ def observe(
         raise InvalidParameter(f"budget must be at least {SMALLEST_BUDGET} observations", part="budget")
     rng = np.random.default_rng(seed)
     windows = _windows(stacks)
-    step = _plane_step(planes, windows)
-    candidates = _candidates(stacks, planes, windows, range(int(rng.integers(step)), len(planes), step))
+    numbers, steps = _seen_planes(stacks, planes, windows, rng)
+    candidates = _candidates(stacks, planes, windows, numbers)
     if not candidates.voxel.size:
         raise InvalidMask("mask holds no voxel that was looked at on its annotated planes", part="mask")
     spacings = [_in_plane_spacing(stacks[plane.stack].grid, plane) for plane in planes]
@@ -124,7 +125,8 @@ def observe(
     rows, weights = _draw(candidates.distance, band, area, budget, cover, rng)
     drawn = candidates.at(rows)
     points = _world_points(stacks, planes, drawn)
-    return Observations(points, drawn.label.astype(float), weights * step, tuple(planes), drawn.plane_of)
+    stands_for = weights * steps[drawn.plane_of]
+    return Observations(points, drawn.label.astype(float), stands_for, tuple(planes), drawn.plane_of)
 
 
 def thinned(observations: Observations, every: int, *, seed: int) -> Observations:
@@ -146,6 +148,25 @@ def thinned(observations: Observations, every: int, *, seed: int) -> Observation
     )
 
 
+def _seen_planes(
+    stacks: Sequence[MaskStack], planes: Sequence[Plane], windows: Sequence[Window], rng: np.random.Generator
+) -> tuple[list[int], Int[np.ndarray, "k"]]:
+    """Numbers of the planes that are looked at, and for how many planes each of all stands."""
+    reached = np.array([_is_reached(plane, windows[plane.stack]) for plane in planes])
+    shown = np.array([bool(section_of(stacks[plane.stack].foreground, plane).any()) for plane in planes])
+    seen: list[int] = []
+    steps = np.ones(len(planes), int)
+    for group in (np.flatnonzero(reached & shown), np.flatnonzero(reached & ~shown)):
+        step = _plane_step([planes[number] for number in group], windows)
+        seen += group[int(rng.integers(step)) :: step].tolist()
+        steps[group] = step
+    return sorted(seen), steps
+
+
+def _is_reached(plane: Plane, window: Window) -> bool:
+    return bool(window[plane.axis].start <= plane.index < window[plane.axis].stop)
+
+
 def _plane_step(planes: Sequence[Plane], windows: Sequence[Window]) -> int:
     """Every how manieth plane is used: one in ``step``, from a random one on."""
     extents = np.array([[cut.stop - cut.start for cut in window] for window in windows])
@@ -157,6 +178,8 @@ def _candidates(
     stacks: Sequence[MaskStack], planes: Sequence[Plane], windows: Sequence[Window], numbers: Sequence[int]
 ) -> _Candidates:
     parts = [_section_candidates(stacks[planes[n].stack], planes[n], n, windows[planes[n].stack]) for n in numbers]
+    if not parts:
+        return _Candidates(np.zeros(0, int), np.zeros(0, int), np.zeros(0, bool), np.zeros(0))
     every = _Candidates(
         np.concatenate([part.voxel for part in parts]),
         np.concatenate([part.plane_of for part in parts]),
@@ -197,8 +220,7 @@ def _section_candidates(stack: MaskStack, plane: Plane, number: int, window: Win
     """The section's voxels that were looked at, within the window."""
     first, second = (axis for axis in range(3) if axis != plane.axis)
     cut = (window[first], window[second])
-    seen = plane.index in range(window[plane.axis].start, window[plane.axis].stop)
-    excluded = section_of(stack.excluded, plane)[cut] | (not seen)
+    excluded = section_of(stack.excluded, plane)[cut]
     foreground = section_of(stack.foreground, plane)[cut] & ~excluded
     distance = contour_distance(foreground, excluded, _in_plane_spacing(stack.grid, plane))
     rows, columns = np.nonzero(~excluded)

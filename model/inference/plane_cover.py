@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int
 
+from model.inference.mask_stack import occupied
+
 #: (axis, index) of a plane of voxels.
 AxisPlane = tuple[int, int]
 #: A volume is solid when at least this share of its foreground lies in 2 x 2 x 2 blocks.
@@ -29,7 +31,7 @@ def cover_planes(foreground: Bool[np.ndarray, "i j k"]) -> list[AxisPlane]:
     Returns:
         planes in ascending order; empty without foreground.
     """
-    held = [_held(foreground, axis) for axis in range(3)]
+    held = [occupied(foreground, axis) for axis in range(3)]
     if not held[0].size:
         return []
     corner = [int(h[0]) for h in held]
@@ -40,15 +42,11 @@ def cover_planes(foreground: Bool[np.ndarray, "i j k"]) -> list[AxisPlane]:
 def _cover_box(box: Bool[np.ndarray, "i j k"]) -> list[AxisPlane]:
     if not _is_solid(box):
         return _mixed_cover(box, limit=sum(box.shape))
-    axis = min(range(3), key=lambda a: (len(_held(box, a)), -a))
-    single = [(axis, int(index)) for index in _held(box, axis)]
+    axis = min(range(3), key=lambda a: (len(occupied(box, a)), -a))
+    single = [(axis, int(index)) for index in occupied(box, axis)]
     limit = int(MIXED_SHARE * len(single))
     mixed = _mixed_cover(box, limit) if limit > 1 else []
     return mixed if 0 < len(mixed) < limit else single
-
-
-def _held(volume: Bool[np.ndarray, "i j k"], axis: int) -> Int[np.ndarray, "m"]:
-    return np.flatnonzero(volume.any(axis=_others(axis)))
 
 
 def _others(axis: int) -> tuple[int, int]:

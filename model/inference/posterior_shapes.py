@@ -39,8 +39,9 @@ def draw_posterior(model: ShapeModel, state: ShapeState, seed: int, step_mm: flo
         seed: non-negative.
         step_mm: grid step of the surface; the model's own when None.
     """
-    chosen = _member(state, seed) if state.members else _around(model, state, seed)
-    return PosteriorShape(chosen, surface_of(model, chosen.latent, chosen.pose, step_mm, chosen.discrepancy))
+    chosen, shift_mm = (_member(state, seed), 0.0) if state.members else _around(model, state, seed)
+    mesh = surface_of(model, chosen.latent, chosen.pose, step_mm, chosen.discrepancy)
+    return PosteriorShape(chosen, replace(mesh, vertices=mesh.vertices + shift_mm * mesh.normals) if shift_mm else mesh)
 
 
 def _member(state: ShapeState, seed: int) -> Fit:
@@ -50,7 +51,8 @@ def _member(state: ShapeState, seed: int) -> Fit:
     return state.members[int(order[seed % count])]
 
 
-def _around(model: ShapeModel, state: ShapeState, seed: int) -> Fit:
+def _around(model: ShapeModel, state: ShapeState, seed: int) -> tuple[Fit, float]:
+    """A draw, and how far (mm) the error that all of the surface shares moves it out, where no discrepancy holds it."""
     if state.covariance is None:
         raise ValueError("a state without uncertainty has no posterior to draw from")
     found, random = state.fits[0], np.random.default_rng(seed)
@@ -60,7 +62,7 @@ def _around(model: ShapeModel, state: ShapeState, seed: int) -> Fit:
     place = Place(found.latent, found.pose).moved(step)
     (held,) = observed_anew(model, found, [place])
     moved = replace(found, latent=place.latent, pose=place.pose)
-    if held is None:
-        return moved
     shift = offset * float(random.standard_normal())
-    return replace(moved, discrepancy=drawn(held, int(random.integers(2**32)), scale, shift))
+    if held is None:
+        return moved, shift
+    return replace(moved, discrepancy=drawn(held, int(random.integers(2**32)), scale, shift)), 0.0

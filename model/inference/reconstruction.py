@@ -5,7 +5,10 @@ observations -> fit -> surface -> uncertainty. Reads no setting, no clock and no
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float
 
 from model.bundle import ShapeModel
 from model.errors import InvalidMask, InvalidParameter
@@ -24,7 +27,7 @@ from model.inference.observations import AnnotatedRule, MaskStack, Observations,
 from model.inference.posterior import FieldDerivatives, fitted_logits, laplace_covariance
 from model.inference.reliability import figures_of, less_trusting, reliability_warnings, thickness_warnings
 from model.inference.rivals import rival_warnings
-from model.inference.surface import differentiated_surface, require_step, surface_of
+from model.inference.surface import differentiated_surface, require_spacing, require_step, surface_of
 from model.inference.thick_slices import through_thickness
 from model.inference.typicality import (
     predictive_probabilities,
@@ -42,8 +45,6 @@ Watch = Callable[[str], None]
 OBSERVATION_BUDGET = 2500
 #: Of them at most so many off the contours for each one near them.
 COVER_SHARE_OF_BAND = 0.6
-#: Range of `Options.resolution_mm`.
-RESOLUTION_RANGE_MM = (0.25, 10.0)
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class Options:
         annotated: which planes were looked at.
         uncertainty: how uncertainty is found.
         mirror: whether left and right may be exchanged.
-        resolution_mm: grid step of the surface; the model's own when None.
+        resolution_mm: grid step of the surface; the model's own when None. Figures are never taken from a coarser one
+            than the model's own, which would be smaller than the body.
         seed: makes the answer repeatable.
         fidelity: from 0, trust the model, to 1, trust the slices: share of what the code leaves unexplained on the
             slices that the surface follows; the one calibrated for the model when None.
@@ -153,7 +155,7 @@ def reconstruct(
     found = corrected(model, settled, stacks, drawing, discrepancy_prior(model.manifest, options.fidelity))
     watch("surface")
     _require_room(model, options, max_voxels, found)
-    mesh, derivatives = _surface(model, found, options)
+    mesh, derivatives = _surface(model, found, options, _judged_step(model, options))
     if mesh.is_empty:
         raise InvalidMask(
             f"The drawing has nothing in common with a {model.manifest.structure}, no shape of it comes near; "
@@ -164,8 +166,6 @@ def reconstruct(
     state = _state(model, observations, found, options)
     spread = surface_spread(model, state, mesh, derivatives)
     sd_mm = None if spread is None else spread.sd()
-    if sd_mm is not None:
-        mesh = replace(mesh, scalars={"surface_sd_mm": sd_mm})
     plain_sd = None if sd_mm is None or state.covariance is None else uncalibrated(model, sd_mm)
     trusted = observations if found.plane_weights is None else reweighted(observations, found.plane_weights)
     space = common_space(stacks)
@@ -177,7 +177,7 @@ def reconstruct(
     named = [*disagreeing_planes(sections), *filter(None, [_doubted(observations, found)])]
     return Reconstruction(
         state=state,
-        mesh=mesh,
+        mesh=_delivered(model, state, options, mesh, sd_mm),
         planes=observations.planes,
         observation_count=len(observations.points),
         residuals=tuple(
@@ -209,11 +209,31 @@ def _settled(
     return trusting, found, observations
 
 
-def _surface(model: ShapeModel, found: Fit, options: Options) -> tuple[Mesh, FieldDerivatives | None]:
+def _judged_step(model: ShapeModel, options: Options) -> float | None:
+    """Grid step (mm) of the surface that figures are taken from: chords of a coarser one would cut off its bends."""
+    step = options.resolution_mm
+    return None if step is None or step >= model.manifest.resolution_mm else step
+
+
+def _surface(
+    model: ShapeModel, found: Fit, options: Options, step_mm: float | None
+) -> tuple[Mesh, FieldDerivatives | None]:
     """The surface, and what its uncertainty will need of the field at its vertices."""
     if options.uncertainty == "none":
-        return surface_of(model, found.latent, found.pose, options.resolution_mm, found.discrepancy), None
-    return differentiated_surface(model, found, options.resolution_mm)
+        return surface_of(model, found.latent, found.pose, step_mm, found.discrepancy), None
+    return differentiated_surface(model, found, step_mm)
+
+
+def _delivered(
+    model: ShapeModel, state: ShapeState, options: Options, judged: Mesh, sd_mm: Float[np.ndarray, "v"] | None
+) -> Mesh:
+    """The surface at the step that was asked for, with its SD where there is uncertainty."""
+    mesh = judged
+    if options.resolution_mm is not None and _judged_step(model, options) is None:
+        mesh, derivatives = _surface(model, state.fits[0], options, options.resolution_mm)
+        spread = surface_spread(model, state, mesh, derivatives)
+        sd_mm = None if spread is None else spread.sd()
+    return mesh if sd_mm is None else replace(mesh, scalars={"surface_sd_mm": sd_mm})
 
 
 def _require_room(model: ShapeModel, options: Options, max_voxels: int | None, found: Fit | None = None) -> None:
@@ -224,12 +244,14 @@ def _require_room(model: ShapeModel, options: Options, max_voxels: int | None, f
 
 
 def _check(options: Options) -> None:
-    low, high = RESOLUTION_RANGE_MM
-    step = options.resolution_mm
-    if step is not None and not low <= step <= high:
-        raise InvalidParameter(
-            f"resolution_mm is {step:g}; a grid step from {low:g} to {high:g} mm is accepted.", part="resolution_mm"
-        )
+    require_spacing(options.resolution_mm, part="resolution_mm")
+    for part, chosen, rules in (
+        ("annotated", options.annotated, AnnotatedRule),
+        ("uncertainty", options.uncertainty, UncertaintyRule),
+        ("mirror", options.mirror, MirrorRule),
+    ):
+        if isinstance(chosen, str) and chosen not in get_args(rules):
+            raise InvalidParameter(f"{part} is {chosen}; {', '.join(get_args(rules))} are accepted.", part=part)
     if options.fidelity is not None and not 0.0 <= options.fidelity <= 1.0:
         raise InvalidParameter(
             f"fidelity is {options.fidelity:g}; 0 (trust the model) to 1 (trust the slices) is accepted.",

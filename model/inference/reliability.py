@@ -111,7 +111,7 @@ def less_trusting(
             return model, judged
     lower = ROUGH_SHARE * model.manifest.likelihood_precision
     doubting = replace(model, manifest=replace(model.manifest, likelihood_precision=lower))
-    return doubting, refit(doubting, observations, tried, options)
+    return doubting, replace(refit(doubting, observations, tried, options), trust=ROUGH_SHARE)
 
 
 def _ever_harder(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Iterator[Fit]:

@@ -103,8 +103,11 @@ def canonical_box(model: ShapeModel) -> Float[np.ndarray, "3"]:
     return np.asarray(model.manifest.half_extent_mm, float) + BOX_MARGIN_MM
 
 
-def require_spacing(spacing_mm: float | None) -> None:
+def require_spacing(spacing_mm: float | None, part: str = "spacing_mm") -> None:
     """Refuse a grid step (mm) that a caller must not choose.
+
+    Args:
+        part: how the caller knows the step.
 
     Raises:
         InvalidParameter: outside 0.25 to 10.
@@ -112,7 +115,7 @@ def require_spacing(spacing_mm: float | None) -> None:
     low, high = SPACING_RANGE_MM
     if spacing_mm is not None and not low <= spacing_mm <= high:
         raise InvalidParameter(
-            f"spacing_mm is {spacing_mm:g}; a grid step from {low:g} to {high:g} mm is accepted.", part="spacing_mm"
+            f"{part} is {spacing_mm:g}; a grid step from {low:g} to {high:g} mm is accepted.", part=part
         )
 
 

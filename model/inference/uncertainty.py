@@ -1,7 +1,8 @@
 """From the posterior to what users read: probability and entropy of voxels, SD of the surface, intervals.
 
 All spread on the surface comes from `SurfaceSpread`: the covariance of the vertices' outward movements, by the Laplace
-posterior over code, pose and discrepancy, or over an ensemble.
+posterior over code and pose or by an ensemble of these, and in either case by what the discrepancy leaves open and by
+the error that all contours share.
 """
 
 from dataclasses import dataclass
@@ -68,14 +69,21 @@ def surface_spread(
         known: derivatives of the fit's field at the vertices, where somebody has them already.
     """
     found = state.fits[0]
+    if state.covariance is None and not state.members:
+        return None
+    canonical = found.pose.to_canonical(mesh.vertices)
+    known = field_derivatives(model, found, canonical) if known is None else known
+    scale, offset_mm = calibrated_scale(model)
+    by_parameter, local = _held(found, canonical, known, scale)
     if state.covariance is not None:
-        canonical = found.pose.to_canonical(mesh.vertices)
-        known = field_derivatives(model, found, canonical) if known is None else known
-        return _laplace_spread(found, state.covariance, canonical, known, *calibrated_scale(model))
-    if state.members:
+        roots = (scale * np.linalg.cholesky(state.covariance)).astype(np.float32)
+        by_point = found.pose.gradient_to_world(known.by_point).astype(np.float32)
+        factors = normal_displacements(by_parameter.astype(np.float32), by_point) @ roots
+    else:
         moves = member_moves(model, found, state.members, mesh, known)
-        return SurfaceSpread((moves - moves.mean(axis=1, keepdims=True)) / np.sqrt(len(state.members) - 1))
-    return None
+        factors = (moves - moves.mean(axis=1, keepdims=True)) / np.sqrt(len(state.members) - 1)
+    shared = np.full((len(canonical), 1), offset_mm, factors.dtype)
+    return SurfaceSpread(np.concatenate([factors, shared], axis=1), local)
 
 
 def calibrated_scale(model: ShapeModel) -> tuple[float, float]:
@@ -94,28 +102,18 @@ def uncalibrated(model: ShapeModel, sd_mm: Float[np.ndarray, "v"]) -> Float[np.n
     return np.asarray(np.sqrt(np.maximum(np.square(sd_mm) - offset**2, 0.0)) / scale)
 
 
-def _laplace_spread(
-    found: Fit,
-    covariance: Float[np.ndarray, "p p"],
-    canonical: Float[np.ndarray, "v 3"],
-    known: FieldDerivatives,
-    scale: float,
-    offset_mm: float,
-) -> SurfaceSpread:
-    """Posterior at canonical points of the surface, see `calibrated_scale` for the last two."""
+def _held(
+    found: Fit, canonical: Float[np.ndarray, "v 3"], known: FieldDerivatives, scale: float
+) -> tuple[Float[np.ndarray, "v p"], LocalSpread | None]:
+    """Derivatives of the field by code and pose where the contours hold it, and what the discrepancy leaves open."""
+    if found.discrepancy is None:
+        return known.by_parameter, None
+    carried, variance = found.discrepancy.held(canonical)
     by_point = found.pose.gradient_to_world(known.by_point).astype(np.float32)
-    by_parameter, local = known.by_parameter, None
-    if found.discrepancy is not None:
-        carried, variance = found.discrepancy.held(canonical)
-        by_parameter = by_parameter - found.discrepancy.slope * carried
-        reach = normal_displacements(
-            np.full((len(by_point), 1), scale * found.discrepancy.slope, np.float32), by_point
-        )[:, 0]
-        local = LocalSpread(found.discrepancy, canonical, variance, reach)
-    factors = np.full((len(canonical), len(covariance) + 1), offset_mm, np.float32)
-    roots = (scale * np.linalg.cholesky(covariance)).astype(np.float32)
-    np.matmul(normal_displacements(by_parameter.astype(np.float32), by_point), roots, out=factors[:, :-1])
-    return SurfaceSpread(factors, local)
+    moves = np.full((len(by_point), 1), scale * found.discrepancy.slope, np.float32)
+    reach = normal_displacements(moves, by_point)[:, 0]
+    by_parameter = known.by_parameter - found.discrepancy.slope * carried
+    return by_parameter, LocalSpread(found.discrepancy, canonical, variance, reach)
 
 
 def volume_estimate(mesh: Mesh, spread: SurfaceSpread | None) -> Estimate:

@@ -11,6 +11,7 @@ from model.bundle import (
     MANIFEST,
     POPULATION,
     REQUIRED_FILES,
+    file_digest,
     open_bundle,
     plain_name,
     read_manifest,
@@ -154,6 +155,46 @@ def test_what_a_manifest_lacks_is_named(bundle, name):
     del values[name]
     (bundle / MANIFEST).write_text(json.dumps(values))
     refusal(bundle, BundleCorrupt, f"lacks {name}")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "naming"),
+    [
+        ("frame", "LPS", "RAS is accepted"),
+        ("units", "cm", "mm is accepted"),
+        ("side", "north", "left, right, mixed, unpaired are accepted"),
+        ("latent_size", 0, "from 1"),
+        ("latent_size", 4, "sigmas"),
+        ("sigmas", [1.0, 2.0], "sigmas of the manifest are 2"),
+        ("sigmas", [1.0, 2.0, -3.0], "positive numbers"),
+        ("sigmas", [1.0, 2.0, None], "positive numbers"),
+        ("half_extent_mm", [10.0, 10.0], "three positive numbers"),
+        ("resolution_mm", 0, "a positive number"),
+        ("resolution_mm", True, "a positive number"),
+        ("likelihood_precision", None, "a positive number"),
+        ("likelihood_precision", "0.1", "a positive number"),
+        ("likelihood_precision", float("nan"), "a positive number"),
+        ("discrepancy", {"spread_mm": 0.6}, "a number for fidelity"),
+        ("usual", {"misfit_mm": 0.6, "misfit_exponent": 0.1}, "surface_sd_mm, surface_sd_exponent"),
+        ("posterior", {"sd_scale": None, "offset_mm": 0.1}, "sd_scale"),
+        ("typical", {"freedom": 9.0}, "density_mean"),
+        ("typical", [1.0], "figures by name"),
+    ],
+)
+def test_a_value_that_cannot_be_is_named_with_what_is_accepted(bundle, name, value, naming):
+    edit(bundle, **{name: value})
+    assert name in refusal(bundle, BundleCorrupt, naming) or name == "latent_size"
+
+
+def test_a_population_of_another_size_is_refused(bundle):
+    codes = np.zeros((5, 2))
+    np.savez(bundle / "population.npz", codes=codes, base_codes=codes, log_densities=np.zeros(5), volumes_ml=np.ones(5))
+    files = json.loads((bundle / MANIFEST).read_text())["files"]
+    edit(bundle, files={**files, "population.npz": file_digest(bundle / "population.npz")})
+    refusal(bundle, BundleCorrupt, "latent_size 3")
+    np.savez(bundle / "population.npz", codes=codes, base_codes=codes, log_densities=np.zeros(5))
+    edit(bundle, files={**files, "population.npz": file_digest(bundle / "population.npz")})
+    refusal(bundle, BundleCorrupt, "lacks volumes_ml")
 
 
 @pytest.mark.parametrize(

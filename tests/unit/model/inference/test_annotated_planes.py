@@ -51,6 +51,28 @@ def test_auto_of_a_symmetric_mask_takes_the_last_axis():
     assert {axis for axis, _ in found(ellipsoid((8, 8, 8), (12, 12, 12)))} == {2}
 
 
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("rule", ["auto", "all", "nonempty"])
+def test_a_stack_of_one_slice_has_that_slice_however_small_its_section(axis, rule):
+    shape = np.insert([30, 30], axis, 1)
+    thin, other = np.zeros(shape, bool), np.zeros(shape, bool)
+    np.moveaxis(thin, axis, 0)[0, 10, 10:13] = True
+    np.moveaxis(other, axis, 0)[0, 8:14, 9:15] = True
+    stacks = [stack_of(thin), stack_of(other, origin=tuple(np.insert([0.0, 0.0], axis, 4.0)), part="mask[1]")]
+    assert find_planes(stacks, rule) == (Plane(0, axis, 0), Plane(1, axis, 0))
+
+
+def test_many_stacks_are_one_object_through_their_neighbours():
+    solid = np.zeros((6, 6, 1), bool)
+    solid[1:5, 1:5] = True
+    chain = [
+        stack_of(solid, origin=(0.0, 0.0, 9.0 * n), part=f"mask[{n}]") for n in np.random.default_rng(0).permutation(60)
+    ]
+    assert len(find_planes(chain, "auto", gap_mm=10.0)) == 60
+    with pytest.raises(InconsistentStacks, match="apart in the world"):
+        find_planes([*chain, stack_of(solid, origin=(0.0, 0.0, 560.0), part="mask[60]")], "auto", gap_mm=10.0)
+
+
 def test_a_narrow_rod_in_many_slices_is_not_taken_for_few_long_ones():
     solid = np.zeros((12, 12, 60), bool)
     solid[4:9, 4:9] = True

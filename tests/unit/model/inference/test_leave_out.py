@@ -32,6 +32,13 @@ def stack_with(wrong, planes=PARALLEL, *, shift=9):
     return replace(stack, foreground=foreground)
 
 
+def test_empty_planes_do_not_outvote_those_that_show_the_object():
+    few = (Plane(0, 2, 12), Plane(0, 2, 20), *(Plane(0, 2, index) for index in (0, 1, 2, 3, 37, 38, 39)))
+    observations = observed(drawn(ELLIPSOID, cube_around(CENTRE), few), few)
+    assert most_wrong(observations) == 0
+    assert fit(MODEL, observations, FitOptions()).plane_weights.all()
+
+
 def test_gain_is_that_of_a_refit_to_second_order():
     observations = observed(stack_with(2, shift=2), PARALLEL)
     start = starting_poses(observations, PLAIN)[0]

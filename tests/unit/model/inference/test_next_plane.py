@@ -52,6 +52,13 @@ def test_the_expected_gain_is_that_of_drawing_the_plane(fidelity, plane):
     assert judged.volume_share == pytest.approx(after[1] / before[1], abs=0.15)
 
 
+def test_a_plane_tells_less_where_the_drawing_was_trusted_less():
+    found, mesh = answer(START, 0.5)
+    cuts = grid_cuts(mesh, GRID, 0, [MIDDLE])
+    trusted, rough = (Judge(MODEL, replace(found, trust=trust), mesh).judged(cuts)[0] for trust in (1.0, 0.1))
+    assert trusted.surface_share < rough.surface_share < 1.0
+
+
 @pytest.mark.parametrize("among", ["grid", "free"])
 def test_the_plane_is_better_than_any_that_was_considered(among):
     found, mesh = answer(START, 0.5)

@@ -169,15 +169,31 @@ def test_the_cover_stays_near_the_object():
 
 
 def test_large_dense_volumes_are_seen_on_evenly_spaced_planes():
-    solid = ellipsoid((60.0, 55.0, 50.0), (70.0, 69.0, 71.0), (140, 140, 140))
+    solid = ellipsoid((62.0, 60.0, 56.0), (75.0, 74.0, 76.0), (150, 150, 150))
     stack = stack_of(solid)
     planes = find_planes([stack], "all")
+    shown = solid.any(axis=(0, 1))
     seen = [observe([stack], planes, budget=4000, seed=seed) for seed in range(8)]
-    assert {int(index) % 2 for o in seen for index in o.points[:, 2]} == {0, 1}
-    for observations in seen:
-        assert len({int(index) % 2 for index in observations.points[:, 2]}) == 1
+    used = [np.unique(np.rint(observations.points[:, 2]).astype(int)) for observations in seen]
+    assert {int(index) % 2 for indices in used for index in indices[shown[indices]]} == {0, 1}
+    for observations, indices in zip(seen, used, strict=True):
+        assert len({int(index) % 2 for index in indices[shown[indices]]}) == 1
         np.testing.assert_allclose(observations.weights.sum(), solid.size, rtol=0.05)
         np.testing.assert_allclose(observations.weights @ observations.labels, solid.sum(), rtol=0.1)
+
+
+@pytest.mark.parametrize("empty", [60, 400])
+def test_few_drawn_planes_among_many_empty_ones_are_all_seen(empty):
+    mask = np.zeros((360, 360, empty), bool)
+    drawn = [empty // 2 + offset for offset in (-9, -3, 3, 9)]
+    mask[20:340, 20:340, drawn] = True
+    stack = stack_of(mask, spacing=(0.5, 0.5, 0.5))
+    planes = [Plane(0, 2, index) for index in range(empty)]
+    for seed in range(3):
+        observations = observe([stack], planes, budget=2000, seed=seed)
+        labels = observations.labels > 0
+        assert {planes[number].index for number in observations.plane_of[labels]} == set(drawn)
+        np.testing.assert_allclose(observations.weights @ labels, 4 * 160.0**2, rtol=0.1)
 
 
 def test_two_stacks_give_points_of_both_in_one_world():

@@ -38,6 +38,17 @@ def test_volumes_of_draws_spread_as_the_interval_says(fidelity):
     )
 
 
+@pytest.mark.parametrize("fidelity", [0.0, 0.5])
+def test_draws_share_the_error_that_all_contours_share(fidelity):
+    model = replace(MODEL, manifest=replace(MODEL.manifest, posterior={"sd_scale": 0.2, "offset_mm": 0.5}))
+    posterior = state(fidelity)
+    mesh = mean_surface(posterior)
+    volumes = [volume_ml(draw_posterior(model, posterior, seed, 1.0).mesh) for seed in range(DRAWS)]
+    expected = surface_spread(model, posterior, mesh).sd_of(vertex_areas(mesh)) / 1000.0
+    assert expected > 0.9 * 0.5 * vertex_areas(mesh).sum() / 1000.0
+    assert np.std(volumes) == pytest.approx(expected, rel=0.35)
+
+
 def test_field_of_draws_spreads_at_the_surface_as_its_sd_says():
     posterior = state(0.5)
     mesh = mean_surface(posterior)

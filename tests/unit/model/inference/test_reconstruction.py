@@ -74,6 +74,31 @@ def test_answer_describes_itself():
     assert answer.log_prior_density == pytest.approx(MODEL.prior.log_density(latent[None])[0][0])
 
 
+def test_a_coarse_surface_changes_no_figure():
+    stack = drawn(ELLIPSOID, cube_around(CENTRE))
+    usual, coarse = (reconstructed(stack, annotated=ORTHOGONAL, resolution_mm=step) for step in (None, 4.0))
+    assert len(coarse.mesh.vertices) < 0.2 * len(usual.mesh.vertices)
+    assert coarse.mesh.scalars["surface_sd_mm"].shape == (len(coarse.mesh.vertices),)
+    assert volume_ml(coarse.mesh) < 0.95 * volume_ml(usual.mesh)
+    assert (coarse.volume_ml, coarse.area_cm2, coarse.extents) == (usual.volume_ml, usual.area_cm2, usual.extents)
+    assert coarse.warnings == usual.warnings
+
+
+def test_one_section_among_empty_planes_is_answered():
+    planes = (Plane(0, 2, 20), *(Plane(0, 2, index) for index in (0, 1, 2, 38, 39, 40)))
+    answer = reconstructed(drawn(ELLIPSOID, cube_around(CENTRE), planes), annotated=planes)
+    assert answer.volume_ml.value > 0
+
+
+@pytest.mark.parametrize("option", ["annotated", "uncertainty", "mirror"])
+def test_a_rule_that_there_is_not_is_refused_by_name(option):
+    options = Options()
+    object.__setattr__(options, option, "often")  # as it comes from callers whose types nobody checks
+    with pytest.raises(InvalidParameter, match=f"{option} is often; .*are accepted") as error:
+        reconstruct(MODEL, [drawn(ELLIPSOID, cube_around(CENTRE))], options)
+    assert error.value.part == option
+
+
 def test_stages_are_told_in_order():
     told = []
     reconstruct(MODEL, [drawn(ELLIPSOID, cube_around(CENTRE))], Options(uncertainty="none"), told.append)

@@ -48,6 +48,7 @@ MODEL = ellipsoid_model()
 POSE = Pose(CENTRE, rotation(25.0, (1.0, -1.0, 2.0)), 0.1, mirrored=True)
 FIT = Fit(np.array([0.8, -0.4, -0.9]), POSE, FitStatus.CONVERGED, "", 1, 0.0, np.eye(3 + POSE_SIZE))
 MESH = surface_of(MODEL, FIT.latent, POSE, 0.7)
+ELLIPSOID_DRAWN = Ellipsoid((14.0, 9.0, 6.0), CENTRE)
 directions = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 
 
@@ -132,6 +133,21 @@ def test_ensemble_spread_is_that_of_its_members():
     spread = surface_spread(MODEL, ShapeState((FIT, *members), None), MESH)
     expected = np.std(shifts, ddof=1) * np.abs(MESH.normals[:, 0])
     np.testing.assert_allclose(spread.sd(), expected, rtol=0.02, atol=3e-4)
+
+
+def test_what_refits_have_in_common_widens_an_ensemble_as_it_widens_laplace():
+    wide = replace(MODEL, manifest=replace(MODEL.manifest, posterior={"sd_scale": 1.4, "offset_mm": 0.3}))
+    stack = drawn(ELLIPSOID_DRAWN, cube_around(CENTRE), PARALLEL)
+    observations = observed(stack, PARALLEL)
+    found = fit(MODEL, observations, FitOptions(robust=False))
+    found = with_discrepancy(MODEL, found, [stack], observations, DiscrepancyPrior(0.6, 0.5))
+    mesh = surface_of(MODEL, found.latent, found.pose, 1.0, found.discrepancy)
+    ensemble = surface_spread(wide, ShapeState((found, found, found), None), mesh)
+    variance = np.square(1.4 * found.discrepancy.slope) * found.discrepancy.variance(
+        found.pose.to_canonical(mesh.vertices)
+    )
+    slope = np.linalg.norm(fitted_jacobians(MODEL, found, mesh.vertices)[2], axis=1)
+    np.testing.assert_allclose(np.square(ensemble.sd()), 0.3**2 + variance / slope**2, rtol=0.02)
 
 
 def test_ensemble_interval_is_that_of_its_volumes():

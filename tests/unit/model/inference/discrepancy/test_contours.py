@@ -1,9 +1,10 @@
 """Contour points of discs and of sections that are cut off."""
 
 import numpy as np
+import pytest
 
 from model.geometry import Grid
-from model.inference.discrepancy.contours import contour_points
+from model.inference.discrepancy.contours import MOST_POINTS, contour_points
 from model.inference.observations import MaskStack, Plane
 
 
@@ -24,6 +25,16 @@ def test_points_lie_on_the_contour_of_the_plane():
     assert np.abs(radius - 12.0).max() < 0.8
     angles = np.degrees(np.arctan2(points[:, 1] - centre, points[:, 0] - centre)) % 360
     assert len(np.unique(angles // 10)) == 36
+
+
+def test_speckled_masks_do_not_give_a_point_for_every_pair():
+    random = np.random.default_rng(0)
+    grid = Grid((400, 400, 8), np.diag([0.2, 0.2, 2.0, 1.0]))
+    stack = MaskStack("mask[0]", grid, random.random(grid.shape) < 0.5, np.zeros(grid.shape, bool))
+    points, numbers = contour_points([stack], [Plane(0, 2, index) for index in range(8)])
+    assert MOST_POINTS // 2 < len(points) <= MOST_POINTS
+    assert (np.bincount(numbers) > MOST_POINTS // 20).all()
+    assert np.ptp(points, axis=0) == pytest.approx([79.8, 79.8, 14.0], abs=0.5)
 
 
 def test_nothing_is_said_beside_voxels_that_were_not_looked_at():
