@@ -122,7 +122,7 @@ def require_spacing(spacing_mm: float | None, part: str = "spacing_mm") -> None:
 def require_step(
     model: ShapeModel, step_mm: float | None, max_voxels: int, *, part: str = "spacing_mm", log_scale: float = 0.0
 ) -> None:
-    """Refuse a grid step at which the model's box has more voxels than allowed.
+    """Refuse a grid step at which the box that is searched has more voxels than allowed.
 
     Args:
         step_mm: in world mm; the model's own when None.
@@ -134,7 +134,7 @@ def require_step(
     """
     scale = float(np.exp(log_scale))
     step = (model.manifest.resolution_mm if step_mm is None else step_mm) * scale
-    if not step > 0 or np.prod([np.ceil(2 * half / step) + 1 for half in model.manifest.half_extent_mm]) <= max_voxels:
+    if not step > 0 or np.prod(np.ceil(2 * canonical_box(model) / step) + 1) <= max_voxels:
         return
     size = f" for an object {1.0 / scale:.2g} times as large as the model's" if log_scale < 0 else ""
     sentence = f"The parameter {part} asks for more than {max_voxels} voxels{size}; ask for a coarser one."

@@ -8,6 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.errors import InvalidParameter, TooLarge
+from model.inference.surface import canonical_box
+from model.inference.surface import canonical_box
 from service import use_cases
 from service.errors import NotComputed
 from service.model_registry import ModelRegistry
@@ -76,14 +78,14 @@ def test_uncertainty_that_was_not_asked_for_is_not_made_up(registry):
 @pytest.mark.parametrize("spacing_mm", [0.5, 1.0, 3.0])
 def test_the_voxel_limit_holds_for_the_models_box(spacing_mm):
     model = ellipsoid_model(NAME)
-    needed = int(np.prod([np.ceil(2 * half / spacing_mm) + 1 for half in model.manifest.half_extent_mm]))
+    needed = int(np.prod(np.ceil(2 * canonical_box(model) / spacing_mm) + 1))
     use_cases.draw(model, 1, 1.0, spacing_mm, needed)
     with pytest.raises(TooLarge):
         use_cases.draw(model, 1, 1.0, spacing_mm, needed - 1)
 
 
 def test_what_is_drawn_around_a_large_object_keeps_the_voxel_limit_too(registry):
-    needed = int(np.prod([np.ceil(2 * half) + 1 for half in registry.get(NAME).manifest.half_extent_mm]))
+    needed = int(np.prod(np.ceil(2 * canonical_box(registry.get(NAME))) + 1))
     for size, refused in ((0.5, False), (1.0, False), (12.0, True)):
         outcome = sized(outcome_of(), size)
         for ask in (use_cases.posterior, lambda *values: use_cases.way_between(values[0], values[1], *values[1:])):

@@ -18,6 +18,7 @@ from model.inference.reconstruction import (
     reconstruct,
 )
 from model.inference.reliability import Figures
+from model.inference.surface import canonical_box
 from model.inference.typicality import ATYPICAL_BY_DENSITY, typicality
 from tests.analytic_model import EllipsoidDecoder, bent_model, ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
@@ -304,7 +305,7 @@ def test_empty_planes_that_stay_empty_agree():
 
 @pytest.mark.parametrize("uncertainty", ["none", "laplace"])
 def test_the_voxel_limit_holds_at_the_size_that_was_found(uncertainty):
-    needed = int(np.prod([np.ceil(2 * half) + 1 for half in MODEL.manifest.half_extent_mm]))
+    needed = int(np.prod(np.ceil(2 * canonical_box(MODEL)) + 1))
     options, stack = Options(uncertainty=uncertainty), drawn(ELLIPSOID, cube_around(CENTRE))
     assert not reconstruct(MODEL, [stack], options, max_voxels=2 * needed).mesh.is_empty
     large = replace(stack, grid=Grid(stack.grid.shape, stack.grid.affine @ np.diag([6.0, 6.0, 6.0, 1.0])))
