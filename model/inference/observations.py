@@ -156,9 +156,9 @@ def _seen_planes(
     shown = np.array([bool(section_of(stacks[plane.stack].foreground, plane).any()) for plane in planes])
     seen: list[int] = []
     steps = np.ones(len(planes), int)
-    for group in (np.flatnonzero(reached & shown), np.flatnonzero(reached & ~shown)):
+    for group in (np.flatnonzero(reached & shown).tolist(), np.flatnonzero(reached & ~shown).tolist()):
         step = _plane_step([planes[number] for number in group], windows)
-        seen += group[int(rng.integers(step)) :: step].tolist()
+        seen += group[int(rng.integers(step)) :: step]
         steps[group] = step
     return sorted(seen), steps
 
