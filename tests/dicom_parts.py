@@ -135,11 +135,27 @@ def rtstruct_of(images: Sequence[Dataset], contours: Sequence[tuple[str, Float[n
     reference.RTReferencedStudySequence = Items([study])
     found.ReferencedFrameOfReferenceSequence = Items([reference])
     region, drawn = Dataset(), Dataset()
-    region.ROINumber, region.ROIName, region.ReferencedFrameOfReferenceUID = 1, "hippocampus", generate_uid()
+    region.ROINumber, region.ROIName = 1, "hippocampus"
+    region.ReferencedFrameOfReferenceUID = images[0].FrameOfReferenceUID
     found.StructureSetROISequence = Items([region])
     drawn.ReferencedROINumber, drawn.ContourSequence = 1, Items([_contour(*contour) for contour in contours])
     found.ROIContourSequence = Items([drawn])
     return found
+
+
+def with_region(found: Dataset, other: Dataset, number: int = 2) -> Dataset:
+    """A structure set with the region of another one, under a number of its own, and what that refers to."""
+    both, added = reread(found), reread(other)
+    added.StructureSetROISequence[0].ROINumber = added.ROIContourSequence[0].ReferencedROINumber = number
+    for name in ("ReferencedFrameOfReferenceSequence", "StructureSetROISequence", "ROIContourSequence"):
+        both[name].value.append(added[name].value[0])
+    return both
+
+
+def name_images(found: Dataset, images: Sequence[Dataset]) -> None:
+    """Let each contour of the first region name its image."""
+    for contour, image in zip(found.ROIContourSequence[0].ContourSequence, images, strict=True):
+        contour.ContourImageSequence = Items([_reference(image)])
 
 
 def _reference(image: Dataset) -> Dataset:

@@ -1,17 +1,21 @@
 """Drawn objects of DICOM, by their class: segmentations and structure sets."""
 
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import BinaryIO
 
 from pydicom import Dataset
 from pydicom.uid import UID, RTStructureSetStorage
 
-from model.errors import InvalidMask, UnreadableImage
+from model.errors import InvalidGeometry, InvalidMask, UnreadableImage
 from model.geometry import Grid
 from model.inference.mask_stack import MaskStack
+from model.inference.stacks import checked_labels
 from service.adapters.dicom.objects import read_object, tolerant
+from service.adapters.dicom.planes import ImageGrid
 from service.adapters.dicom.segmentations import SEGMENTATIONS, read_segmentation
-from service.adapters.dicom.structure_sets import read_structure_set
+from service.adapters.dicom.structure_sets import frame_of_regions, images_of_regions, read_structure_set
 from service.adapters.image_guard import ImageLimits
 
 #: SOP classes of drawings that are read.
@@ -36,42 +40,104 @@ def stacks_of_object(
 
     Args:
         labels: numbers of segments or regions; all when None.
-        home: grid of the images that were drawn on, if they are at hand; drawings on them lie on it.
+        home: grid of the images that were drawn on, if they are at hand; drawings on them lie on it. When it says
+            in which frame of reference it lies (`ImageGrid`), the drawing has to lie in the same.
 
     Raises:
         UnreadableImage: neither SEG nor RTSTRUCT, or damaged.
+        InvalidGeometry: drawn in several frames of reference, or in another than the images'.
         InvalidMask, InvalidGeometry, InvalidParameter, TooLarge: as the readers say.
     """
+    checked_labels(labels)
     with tolerant(part):
         kind = found.get("SOPClassUID")
-    if kind in SEGMENTATIONS:
-        stacks = read_segmentation(found, part, limits, labels, home)
-    elif kind == RTStructureSetStorage:
-        stacks = read_structure_set(found, part, limits, labels, home)
-    else:
+    if kind not in DRAWINGS:
         raise UnreadableImage(
             f"{part} is a DICOM object of another kind; segmentations (SEG) and structure sets (RTSTRUCT) are accepted",
             part=part,
         )
-    return tuple(replace(stack, space="LPS") for stack in stacks)
+    _require_frame(frame_of_reference(found, part, labels), part, home)
+    read = read_segmentation if kind in SEGMENTATIONS else read_structure_set
+    return tuple(replace(stack, space="LPS") for stack in read(found, part, limits, labels, home))
 
 
-def referenced_series(found: Dataset) -> UID:
+def frame_of_reference(found: Dataset, part: str, labels: frozenset[int] | None = None) -> str:
+    """UID of the frame of reference that the chosen segments or regions are drawn in; empty when the object says none.
+
+    Raises:
+        InvalidGeometry: regions of several.
+    """
+    with tolerant(part):
+        if found.SOPClassUID == RTStructureSetStorage:
+            return frame_of_regions(found, part, labels)
+        return str(found.get("FrameOfReferenceUID") or "")
+
+
+def _require_frame(frame: str, part: str, home: Grid | None) -> None:
+    images = home.frame_of_reference if isinstance(home, ImageGrid) else ""
+    if frame and images and frame != images:
+        raise InvalidGeometry(
+            f"{part} is drawn in another frame of reference than that of its images; one in theirs is accepted",
+            part=part,
+        )
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """A series that a drawing refers to: its UID, its frame of reference where said, its images."""
+
+    series: UID
+    frame: str
+    images: tuple[str, ...]
+
+
+def referenced_series(found: Dataset, labels: frozenset[int] | None = None) -> UID:
     """Series Instance UID of the images that were drawn on.
+
+    Of several series it is that whose images most of the chosen contours (or the frames) name; where they name
+    none, the first in the frame of reference of the chosen regions.
+
+    Args:
+        labels: ROI numbers that count; all when None.
 
     Raises:
         InvalidMask: the object refers to no series.
+        InvalidGeometry: the regions are drawn in several frames of reference.
     """
     with tolerant("object"):
-        if found.SOPClassUID == RTStructureSetStorage:
-            items = [
-                series
-                for frame in found.get("ReferencedFrameOfReferenceSequence") or []
-                for study in frame.get("RTReferencedStudySequence") or []
-                for series in study.get("RTReferencedSeriesSequence") or []
-            ]
-        else:
-            items = list(found.get("ReferencedSeriesSequence") or [])
-        if items:
-            return UID(items[0].SeriesInstanceUID)
-    raise InvalidMask("The object refers to no series of images; a drawing on images is accepted.", part="object")
+        is_structures = found.SOPClassUID == RTStructureSetStorage
+        references = list(_of_structures(found) if is_structures else _of_segmentation(found))
+        if not references:
+            raise InvalidMask(
+                "The object refers to no series of images; a drawing on images is accepted.", part="object"
+            )
+        if len({reference.series for reference in references}) == 1:
+            return references[0].series
+        named = Counter(images_of_regions(found, "object", labels) if is_structures else _images_of_frames(found))
+        frame = frame_of_reference(found, "object", labels)
+        best = max(references, key=lambda r: (sum(named[image] for image in r.images), r.frame == frame))
+        return best.series
+
+
+def _of_structures(found: Dataset) -> Iterator[_Reference]:
+    for frame in found.get("ReferencedFrameOfReferenceSequence") or []:
+        for study in frame.get("RTReferencedStudySequence") or []:
+            for series in study.get("RTReferencedSeriesSequence") or []:
+                yield _reference(series, str(frame.get("FrameOfReferenceUID") or ""), "ContourImageSequence")
+
+
+def _of_segmentation(found: Dataset) -> Iterator[_Reference]:
+    for series in found.get("ReferencedSeriesSequence") or []:
+        yield _reference(series, "", "ReferencedInstanceSequence")
+
+
+def _reference(series: Dataset, frame: str, name: str) -> _Reference:
+    images = tuple(str(image.ReferencedSOPInstanceUID) for image in series.get(name) or [])
+    return _Reference(UID(series.SeriesInstanceUID), frame, images)
+
+
+def _images_of_frames(found: Dataset) -> Iterator[str]:
+    for frame in found.get("PerFrameFunctionalGroupsSequence") or []:
+        for derivation in frame.get("DerivationImageSequence") or []:
+            for source in derivation.get("SourceImageSequence") or []:
+                yield str(source.ReferencedSOPInstanceUID)

@@ -1,12 +1,19 @@
 """RT structure sets to mask stacks (PS3.3, C.8.8.6): closed planar contours on any planes.
 
-Contours of one region and plane are filled by the even-odd rule, which is what the standard means by
-both of its ways to draw holes: a keyhole's channel is run through twice and encloses nothing, and of an
-XOR pair (CLOSEDPLANAR_XOR) the inner contour takes away. Nested plain contours are read in the same way,
-as nearly all who write them mean it. Several regions are joined. A label is an ROI number.
+Each contour is filled by the even-odd rule, so that a keyhole's channel, which is run through twice, encloses
+nothing. Contours of one region and plane are put together as their type says:
+
+- CLOSEDPLANAR_XOR: what an odd number of them encloses.
+- CLOSED_PLANAR: contours that overlap in part are united. One inside another takes away, as nearly all who write
+  such contours mean it, and one inside that adds again.
+
+A contour that comes twice counts once. One that encloses no pixel's centre stands for the pixel at its middle. Several
+regions are joined. A label is an ROI number. Points, open contours and those of fewer than three points enclose
+nothing and are passed over, as are regions without a closed contour.
 """
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,16 +26,22 @@ from model.geometry import Grid
 from model.inference.mask_stack import MaskStack
 from model.inference.stacks import checked_labels
 from service.adapters.dicom.objects import tolerant
-from service.adapters.dicom.planes import PARALLEL, FramePlane, stack_grid
+from service.adapters.dicom.planes import PARALLEL, REGULAR_SHARE, FramePlane, stack_grid
 from service.adapters.dicom.segmentations import require_room, stacks_of
 from service.adapters.image_guard import LPS_TO_RAS, ImageLimits
 
-#: Geometric types that enclose an area.
+#: Geometric types that enclose an area; of the second one those of a region and plane take each other away.
 CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
 #: Numbers of a contour's data below which it encloses nothing.
 SMALLEST_CONTOUR = 9
 #: Distance of a contour's points from their common plane that is tolerated (mm).
 FLATNESS_MM = 0.1
+#: Digits (of mm) in which contours agree that are the same.
+SAME_DIGITS = 3
+#: Share of a contour's area that one inside it has at least when it is the same, rounded otherwise.
+SAME_AREA = 0.9
+#: Numbers listed in a message, at most.
+LISTED_NUMBERS = 12
 #: Pixels of planes that no image says: this share of the drawing's extent, within the range (mm).
 PIXEL_SHARE, PIXEL_RANGE_MM = 1 / 128, (0.25, 1.0)
 #: Free room around a drawing without an image (mm).
@@ -37,11 +50,26 @@ MARGIN_MM = 20.0
 
 @dataclass(frozen=True)
 class Contour:
-    """A closed planar contour, LPS mm: its ROI number, its points and its plane's unit normal."""
+    """A closed planar contour, LPS mm.
+
+    Attributes:
+        region: its ROI number.
+        points: in their order.
+        normal: of its plane, a unit vector.
+        area: that it encloses (mm2).
+        is_xor: whether it is of the type CLOSEDPLANAR_XOR.
+    """
 
     region: int
     points: Float[np.ndarray, "n 3"]
     normal: Float[np.ndarray, "3"]
+    area: float
+    is_xor: bool
+
+    @property
+    def middle(self) -> Float[np.ndarray, "3"]:
+        """Mean of its points (mm)."""
+        return np.asarray(self.points.mean(axis=0))
 
 
 def read_structure_set(
@@ -58,21 +86,21 @@ def read_structure_set(
         home: grid of the images that were drawn on; contours on their planes are drawn on its pixels.
 
     Raises:
-        UnreadableImage, InvalidGeometry: damaged, or contours that are not planar.
-        InvalidMask: no closed contour, or no such region.
+        UnreadableImage, InvalidGeometry: damaged, or contours that are not planar or lie beside the images.
+        InvalidMask: no closed contour, or a region that the object does not have.
         TooLarge: over a limit.
     """
     checked_labels(labels)
     contours = closed_contours(found, part, labels)
-    sheets = _sheets(contours)
     grids: list[Grid] = []
     volumes, drawn = [], []
-    for group in _by_direction(sheets):
-        grid, places = _grid_of(group, home)
+    for group in _by_direction(contours):
+        normal, sheets = group[0].normal, _sheets(group)
+        grid, places = _grid_of(sheets, normal, home)
         require_room([*grids, grid], part, limits)
         volume = np.zeros(grid.shape, bool)
-        for place, sheet in zip(places, group, strict=True):
-            volume[:, :, place] |= _filled(sheet, grid)
+        for place, sheet in zip(places, sheets, strict=True):
+            volume[:, :, place] |= _filled(sheet, grid, part)
         grids.append(grid)
         volumes.append(volume)
         drawn.append(np.unique(places))
@@ -80,87 +108,147 @@ def read_structure_set(
 
 
 def closed_contours(found: Dataset, part: str, labels: frozenset[int] | None) -> list[Contour]:
-    """The closed planar contours of the chosen regions."""
+    """The closed planar contours of the chosen regions, the largest first."""
     with tolerant(part):
-        regions = {int(r.ReferencedROINumber): r.get("ContourSequence") or [] for r in found.ROIContourSequence}
-        if labels is not None and labels.isdisjoint(regions):
-            listed = ", ".join(map(str, sorted(regions)[:12])) or "none"
-            raise InvalidMask(f"{part} has no such region; regions that are there: {listed}", part=part)
         points = [
-            (number, np.array(item.ContourData, float).reshape(-1, 3))
-            for number, items in regions.items()
+            (number, np.array(item.ContourData, float).reshape(-1, 3), item.ContourGeometricType == CLOSED[1])
+            for number, items in _drawn_regions(found, part, labels).items()
             for item in items
-            if (labels is None or number in labels)
-            and item.ContourGeometricType in CLOSED
-            and len(item.ContourData) >= SMALLEST_CONTOUR
         ]
     if not points:
         raise InvalidMask(f"{part} holds no closed planar contour of the region; one or more are needed", part=part)
-    return [_flat(region, contour, part) for region, contour in points]
+    contours = [_flat(*contour, part) for contour in points]
+    return sorted(contours, key=lambda contour: contour.area, reverse=True)
 
 
-def _flat(region: int, points: Float[np.ndarray, "n 3"], part: str) -> Contour:
+def frame_of_regions(found: Dataset, part: str, labels: frozenset[int] | None = None) -> str:
+    """UID of the frame of reference that the chosen regions are drawn in; empty when none says it.
+
+    Raises:
+        InvalidMask: a region that the object does not have.
+        InvalidGeometry: regions of several frames of reference.
+    """
+    frames: dict[str, list[int]] = defaultdict(list)
+    with tolerant(part):
+        drawn = _drawn_regions(found, part, labels)
+        for region in found.get("StructureSetROISequence") or []:
+            frame = str(region.get("ReferencedFrameOfReferenceUID") or "")
+            if frame and int(region.ROINumber) in drawn:
+                frames[frame].append(int(region.ROINumber))
+    if len(frames) > 1:
+        listed = " and ".join(f"region {_listed(numbers)}" for numbers in frames.values())
+        raise InvalidGeometry(
+            f"{part} draws {listed} in different frames of reference; regions of one frame are accepted", part=part
+        )
+    return next(iter(frames), "")
+
+
+def images_of_regions(found: Dataset, part: str, labels: frozenset[int] | None = None) -> list[str]:
+    """SOP Instance UIDs of the images that the chosen regions' closed contours name, as often as they do."""
+    with tolerant(part):
+        return [
+            str(image.ReferencedSOPInstanceUID)
+            for items in _drawn_regions(found, part, labels).values()
+            for item in items
+            for image in item.get("ContourImageSequence") or []
+        ]
+
+
+def _drawn_regions(found: Dataset, part: str, labels: frozenset[int] | None) -> dict[int, list[Dataset]]:
+    """The closed planar contours of each chosen region that has any; call within `tolerant`."""
+    drawn: dict[int, list[Dataset]] = defaultdict(list)
+    known = {int(region.ROINumber) for region in found.get("StructureSetROISequence") or []}
+    for region in found.get("ROIContourSequence") or []:
+        number = int(region.ReferencedROINumber)
+        known.add(number)
+        if labels is None or number in labels:
+            items = region.get("ContourSequence") or []
+            drawn[number] += [
+                item
+                for item in items
+                if item.ContourGeometricType in CLOSED and len(item.ContourData) >= SMALLEST_CONTOUR
+            ]
+    if labels is not None and not labels <= known:
+        raise InvalidMask(
+            f"{part} has no region {_listed(labels - known)}; regions that are there: {_listed(known) or 'none'}",
+            part=part,
+        )
+    return {number: items for number, items in drawn.items() if items}
+
+
+def _listed(numbers: Iterable[int]) -> str:
+    every = sorted(numbers)
+    rest = len(every) - LISTED_NUMBERS
+    return ", ".join(map(str, every[:LISTED_NUMBERS])) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _flat(region: int, points: Float[np.ndarray, "n 3"], is_xor: bool, part: str) -> Contour:
     """A contour with its normal (Newell), turned so that its largest component is positive."""
     following = np.roll(points, -1, axis=0)
     middle = points.mean(axis=0)
     area = np.cross(points - middle, following - middle).sum(axis=0)
     length = np.linalg.norm(area)
-    normal = area / length if length > 0 else np.full(3, np.nan)
+    if length == 0:
+        raise InvalidGeometry(f"{part} has a closed contour around no area; one around an area is accepted", part=part)
+    normal = area / length
     if not np.isfinite(points).all() or not np.abs((points - middle) @ normal).max() <= FLATNESS_MM:
         raise InvalidGeometry(f"{part} has a contour that does not lie in a plane; planar ones are accepted", part=part)
-    return Contour(region, points, normal * np.sign(normal[np.argmax(np.abs(normal))]))
+    return Contour(region, points, normal * np.sign(normal[np.argmax(np.abs(normal))]), float(length) / 2, is_xor)
 
 
-def _sheets(contours: Sequence[Contour]) -> list[list[Contour]]:
-    """Contours by the plane they lie in."""
-    sheets: list[list[Contour]] = []
+def _by_direction(contours: Sequence[Contour]) -> list[list[Contour]]:
+    """Contours whose planes are parallel; the largest, whose normal is surest, stays the first of each."""
+    groups: list[list[Contour]] = []
     for contour in contours:
-        home = next((sheet for sheet in sheets if _same_plane(sheet[0], contour)), None)
+        home = next((group for group in groups if _parallel(group[0], contour)), None)
         if home is None:
-            sheets.append([contour])
+            groups.append([contour])
         else:
             home.append(contour)
-    return sheets
+    return groups
+
+
+def _sheets(group: Sequence[Contour]) -> list[list[Contour]]:
+    """Parallel contours by the plane they lie in, from the lowest to the highest.
+
+    Each may lie off its plane by `FLATNESS_MM`. Where the planes are far apart, so may two of one plane.
+    """
+    heights = np.array([group[0].normal @ contour.middle for contour in group])
+    order = np.argsort(heights, kind="stable")
+    gaps = np.diff(heights[order])
+    usual = np.median(gaps[gaps > FLATNESS_MM]) if (gaps > FLATNESS_MM).any() else 0.0
+    apart = min(max(FLATNESS_MM, REGULAR_SHARE * usual), 2 * FLATNESS_MM)
+    sheets: list[list[int]] = [[]]
+    for number in order.tolist():
+        if sheets[-1] and heights[number] - heights[sheets[-1][0]] > apart:
+            sheets.append([])
+        sheets[-1].append(number)
+    return [[group[number] for number in sorted(sheet)] for sheet in sheets]
 
 
 def _parallel(first: Contour, second: Contour) -> bool:
     return bool(np.linalg.norm(np.cross(first.normal, second.normal)) <= 10 * PARALLEL)
 
 
-def _same_plane(first: Contour, second: Contour) -> bool:
-    apart = abs(first.normal @ (second.points.mean(axis=0) - first.points.mean(axis=0)))
-    return _parallel(first, second) and bool(apart <= FLATNESS_MM)
-
-
-def _by_direction(sheets: Sequence[list[Contour]]) -> list[list[list[Contour]]]:
-    groups: list[list[list[Contour]]] = []
-    for sheet in sheets:
-        home = next((group for group in groups if _parallel(group[0][0], sheet[0])), None)
-        if home is None:
-            groups.append([sheet])
-        else:
-            home.append(sheet)
-    return groups
-
-
-def _grid_of(group: Sequence[list[Contour]], home: Grid | None) -> tuple[Grid, list[int]]:
-    """A grid through the planes of a group: the images' where the planes are theirs."""
-    if home is not None and np.linalg.norm(np.cross(home.directions[:, 2], _ras(group[0][0].normal))) < 10 * PARALLEL:
-        points = np.array([_ras(sheet[0].points.mean(axis=0)) for sheet in group])
-        index = home.to_index(points)[:, 2]
-        near = np.abs(index - np.rint(index)).max() * home.spacing[2] <= FLATNESS_MM
+def _grid_of(
+    sheets: Sequence[list[Contour]], normal: Float[np.ndarray, "3"], home: Grid | None
+) -> tuple[Grid, list[int]]:
+    """A grid through the planes of a direction: the images' where the planes are theirs."""
+    if home is not None and np.linalg.norm(np.cross(home.directions[:, 2], _ras(normal))) < 10 * PARALLEL:
+        index = home.to_index(np.array([_ras(sheet[0].middle) for sheet in sheets]))[:, 2]
+        near = np.abs(index - np.rint(index)).max() <= max(FLATNESS_MM / home.spacing[2], REGULAR_SHARE)
         if near and index.min() > -0.5 and index.max() < home.shape[2] - 0.5:
             return home, [round(i) for i in index.tolist()]
-    return _own_grid(group)
+    return _own_grid(sheets, normal)
 
 
 def _ras(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return np.asarray(vectors @ LPS_TO_RAS[:3, :3])
 
 
-def _own_grid(group: Sequence[list[Contour]]) -> tuple[Grid, list[int]]:
-    points = np.concatenate([contour.points for sheet in group for contour in sheet])
-    row, column = _axes(group[0][0].normal)
+def _own_grid(sheets: Sequence[list[Contour]], across: Float[np.ndarray, "3"]) -> tuple[Grid, list[int]]:
+    points = np.concatenate([contour.points for sheet in sheets for contour in sheet])
+    row, column = _axes(across)
     along = points @ np.stack([row, column]).T
     low, high = along.min(axis=0) - MARGIN_MM, along.max(axis=0) + MARGIN_MM
     pixel = float(np.clip((high - low).max() * PIXEL_SHARE, *PIXEL_RANGE_MM))
@@ -169,7 +257,7 @@ def _own_grid(group: Sequence[list[Contour]]) -> tuple[Grid, list[int]]:
     corner = low[0] * row + low[1] * column
     planes = [
         FramePlane(corner + normal * (sheet[0].points @ normal).mean(), row, column, (pixel, pixel), np.nan)
-        for sheet in group
+        for sheet in sheets
     ]
     grid, places = stack_grid(planes, columns, rows)
     return _with_room(grid, [int(place) for place in places])
@@ -192,10 +280,96 @@ def _axes(normal: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"], Float
     return row, np.asarray(np.cross(normal, row))
 
 
-def _filled(sheet: Sequence[Contour], grid: Grid) -> Bool[np.ndarray, "i j"]:
-    """Pixels whose centres the contours of one plane enclose: even-odd within a region, any of the regions."""
-    inside = {contour.region: np.zeros(grid.shape[:2], bool) for contour in sheet}
+def _filled(sheet: Sequence[Contour], grid: Grid, part: str) -> Bool[np.ndarray, "i j"]:
+    """Pixels that the contours of one plane, the largest first, enclose: those of any region."""
+    regions: dict[int, dict[bytes, Contour]] = defaultdict(dict)
     for contour in sheet:
-        index = grid.to_index(_ras(contour.points))[:, :2]
-        inside[contour.region] ^= polygon2mask(grid.shape[:2], index)  # type: ignore[no-untyped-call]
-    return np.asarray(np.any(list(inside.values()), axis=0))
+        regions[contour.region].setdefault(_identity(contour), contour)
+    filled = np.zeros(grid.shape[:2], bool)
+    for contours in regions.values():
+        filled |= _filled_region(list(contours.values()), grid, part)
+    return filled
+
+
+def _identity(contour: Contour) -> bytes:
+    """The same for contours of the same points, wherever they begin and whichever way they run."""
+    return np.unique(np.round(contour.points, SAME_DIGITS) + 0.0, axis=0).tobytes()
+
+
+def _filled_region(contours: Sequence[Contour], grid: Grid, part: str) -> Bool[np.ndarray, "i j"]:
+    nest = _Nest(grid.shape[:2])
+    crossed = np.zeros(grid.shape[:2], bool)
+    specks = []
+    for contour in contours:
+        mask = _enclosed(contour, grid)
+        if not mask.any():
+            specks.append(_pixel_of(contour, grid, part))
+        elif contour.is_xor:
+            crossed ^= mask
+        else:
+            nest.add(contour, mask)
+    filled = nest.filled ^ crossed
+    for column, row in specks:
+        filled[column, row] = True
+    return filled
+
+
+def _enclosed(contour: Contour, grid: Grid) -> Bool[np.ndarray, "i j"]:
+    """Pixels whose centres a contour encloses by the even-odd rule."""
+    index = grid.to_index(_ras(contour.points))[:, :2]
+    return np.asarray(polygon2mask(grid.shape[:2], index))  # type: ignore[no-untyped-call]
+
+
+def _pixel_of(contour: Contour, grid: Grid, part: str) -> tuple[int, int]:
+    """The pixel at the middle of a contour that encloses no pixel's centre."""
+    column, row = (round(i) for i in grid.to_index(_ras(contour.middle[None]))[0, :2].tolist())
+    if not (0 <= column < grid.shape[0] and 0 <= row < grid.shape[1]):
+        raise InvalidGeometry(
+            f"{part} has a contour of region {contour.region} beside the images; contours on them are accepted",
+            part=part,
+        )
+    return column, row
+
+
+class _Nest:
+    """Plain contours of one region and plane, painted from the largest on: those inside others take away or add."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.filled = np.zeros(shape, bool)
+        self._innermost = np.full(shape, -1)
+        self._contours: list[Contour] = []
+        self._pixels: list[int] = []
+        self._holders: list[int] = []
+        self._levels: list[int] = []
+
+    def add(self, contour: Contour, mask: Bool[np.ndarray, "i j"]) -> None:
+        """Paint a contour that is not larger than those before, and the pixels that it encloses."""
+        holder, pixels = self._holder_of(mask), int(mask.sum())
+        if holder >= 0 and (pixels == self._pixels[holder] or _is_same(contour, self._contours[holder])):
+            return
+        level = self._levels[holder] + 1 if holder >= 0 else 0
+        self.filled[mask] = level % 2 == 0
+        self._innermost[mask] = len(self._contours)
+        self._contours.append(contour)
+        self._pixels.append(pixels)
+        self._holders.append(holder)
+        self._levels.append(level)
+
+    def _holder_of(self, mask: Bool[np.ndarray, "i j"]) -> int:
+        """The innermost contour that holds all that the pixels lie in, or is that itself; -1 when none does.
+
+        Whoever holds a contour has a lower number, so the highest gives way to its holder until one is left.
+        """
+        held = set(np.unique(self._innermost[mask]).tolist())
+        while len(held) > 1:
+            highest = max(held)
+            held.remove(highest)
+            held.add(-1 if -1 in held else self._holders[highest])
+        return int(held.pop())
+
+
+def _is_same(inner: Contour, outer: Contour) -> bool:
+    """Whether a contour inside another is that one, written with other digits."""
+    apart = np.abs(inner.points.min(axis=0) - outer.points.min(axis=0))
+    apart = np.maximum(apart, np.abs(inner.points.max(axis=0) - outer.points.max(axis=0)))
+    return bool(apart.max() <= FLATNESS_MM) and inner.area >= SAME_AREA * outer.area
