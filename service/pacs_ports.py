@@ -12,11 +12,12 @@ DRAWING_JOB = "drawing"
 
 
 class Disposition(StrEnum):
-    """What becomes of a received object; it has been acknowledged in every case but the last."""
+    """What becomes of a received object; the sender is told of a failure in all cases but the first two."""
 
     ACCEPTED = "accepted"
     LEFT_ALONE = "left alone"
     QUARANTINED = "quarantined"
+    MISPLACED = "of another study"
     FAILED = "failed"
 
 
@@ -36,14 +37,28 @@ class Receipt:
 class ObjectReceiver(Protocol):
     """Takes DICOM objects, whichever way they come."""
 
-    def receive(self, data: bytes, sender: str) -> Receipt:
+    def receive(self, data: bytes, sender: str, study: str | None = None) -> Receipt:
         """Take one object; when it is accepted it is on disk and in a durable job by then.
 
         Args:
             data: the file.
             sender: calling AE title, or the name of the way it came.
+            study: the only study whose objects are taken; any when None.
         """
         ...
+
+
+@dataclass(frozen=True)
+class Retrieval:
+    """What came of a series.
+
+    Attributes:
+        images: headers without pixels, each once, in no order.
+        failed: how many more the archive has and could not send.
+    """
+
+    images: Sequence[DicomObject]
+    failed: int = 0
 
 
 class PictureArchive(Protocol):
@@ -52,16 +67,29 @@ class PictureArchive(Protocol):
     Every call may raise `ArchiveUnavailable` (try again later) or `ArchiveRefused` (do not).
     """
 
-    def images(self, study: str, series: str) -> list[DicomObject]:
-        """Headers of a series without pixels, in no order; none when the archive does not have it."""
+    @property
+    def commits(self) -> bool:
+        """Whether it is asked to commit itself to what it stores."""
+        ...
+
+    def images(self, study: str, series: str) -> Retrieval:
+        """Headers of a series; none when the archive does not have it."""
         ...
 
     def store(self, objects: Sequence[DicomObject]) -> None:
         """Store objects of one study; those that are there stay as they are."""
         ...
 
-    def holds(self, objects: Sequence[DicomObject]) -> bool:
-        """Whether the archive says that every one of the objects is stored."""
+    def lacking(self, objects: Sequence[DicomObject]) -> list[DicomObject]:
+        """Those of the objects that a query does not find."""
+        ...
+
+    def ask_commitment(self, objects: Sequence[DicomObject], transaction: str) -> None:
+        """Ask the archive to commit itself to objects that it was sent; it reports later, to the listener.
+
+        Args:
+            transaction: UID that the report will name; to ask twice under the same one is to ask once.
+        """
         ...
 
     def close(self) -> None:

@@ -1,11 +1,12 @@
 """A receiver beside a real archive (Orthanc): its files, a worker on demand, studies and results."""
 
 import io
+import json
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from pydicom import Dataset, dcmread
@@ -19,7 +20,7 @@ from service.adapters.pacs.archives import open_archive
 from service.adapters.pacs.audit import AuditTrail
 from service.adapters.pacs.configuration import Archive, MoveDestination, PacsConfiguration, Rule
 from service.adapters.pacs.delivery import Desk
-from service.adapters.pacs.inbox import Inbox
+from service.adapters.pacs.inbox import QUARANTINE, REASON, Inbox
 from service.jobs.drawings import DrawingTools, drawing_kind
 from service.model_registry import ModelRegistry
 from service.observability import make_log
@@ -58,17 +59,26 @@ class Service:
     @contextmanager
     def working(self) -> Iterator[None]:
         registry = ModelRegistry({"ellipsoid": ellipsoid_model("ellipsoid")})
-        desk = Desk(self.configuration, self.blobs, self.audit, partial(open_archive, blobs=self.blobs), "MORPHOFLOW")
+        desk = Desk(self.configuration, self.blobs, self.audit, open_archive, "MORPHOFLOW")
         limits = ImageLimits(max_bytes=1 << 24, max_voxels=1 << 22)
         kind = drawing_kind(DrawingTools(desk, registry, limits, "0.1.0", self.log))
         with running_worker([kind], WorkerOptions(self.url, "a-0"), self.log):
             yield
 
     def until_empty(self) -> None:
-        limit = time.monotonic() + PATIENCE_S
-        while self.inbox.backlog() and time.monotonic() < limit:
-            time.sleep(0.05)
-        assert self.inbox.backlog() == 0
+        until(lambda: not self.inbox.backlog())
+
+    def reasons(self) -> list[str]:
+        """Why objects are in quarantine."""
+        keys = [key for key in self.blobs.list(f"{QUARANTINE}/") if key.endswith(REASON)]
+        return [json.loads(self.blobs.get(key))["reason"] for key in keys]
+
+
+def until(holds: Callable[[], object]) -> None:
+    limit = time.monotonic() + PATIENCE_S
+    while not holds() and time.monotonic() < limit:
+        time.sleep(0.05)
+    assert holds()
 
 
 def by_dicomweb(orthanc: Orthanc) -> Archive:
@@ -95,13 +105,24 @@ def service_with(folder: Path, archive: Archive, **changes) -> Service:
 
 def new_study(orthanc: Orthanc, folder: Path) -> tuple[list[Dataset], Dataset]:
     """Images in the archive, and a drawing on them."""
+    images, drawing = drawn_series()
+    put_images(orthanc, folder, images)
+    return images, drawing
+
+
+def drawn_series() -> tuple[list[Dataset], Dataset]:
+    """Images, and a drawing on them."""
     images = mr_series()
-    (folder / "images").mkdir(exist_ok=True)
-    for number, image in enumerate(images):
-        (folder / "images" / f"{number}.dcm").write_bytes(file_bytes(image))
-    send(folder / "images", orthanc.dicom_port)
     drawn, _ = sparse_ellipsoid()
     return images, seg_of(images, drawn)
+
+
+def put_images(orthanc: Orthanc, folder: Path, images: Sequence[Dataset]) -> None:
+    """Images into the archive."""
+    place = Path(tempfile.mkdtemp(dir=folder))
+    for number, image in enumerate(images):
+        (place / f"{number}.dcm").write_bytes(file_bytes(image))
+    send(place, orthanc.dicom_port)
 
 
 def results_in(orthanc: Orthanc, study: str) -> list[Dataset]:

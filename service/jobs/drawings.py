@@ -99,20 +99,21 @@ def _stages(tools: DrawingTools, run: JobRun, drawing: Record) -> Iterator[Stage
 
 
 def _until_done(tools: DrawingTools, run: JobRun, stage: Stage) -> Record:
-    """The stage's answer, after as many turns as it takes."""
+    """The stage's answer, after as many turns as it takes; the time for images runs while they are missing."""
     configuration = tools.desk.configuration
-    waited, wait_s = 0.0, configuration.retry_first_s
+    missed_s, wait_s = 0.0, configuration.retry_first_s
     for turn in count():
         try:
             answer = stage(turn)
         except GivenUp as error:
             return {"state": REFUSED, "reason": str(error)}
-        if answer["state"] == MISSING and waited >= configuration.images_awaited_s:
+        if answer["state"] == MISSING and missed_s >= configuration.images_awaited_s:
             return {**answer, "state": REFUSED}
         if answer["state"] in (DONE, REFUSED):
             break
         run.wait(wait_s)
-        waited, wait_s = waited + wait_s, min(2 * wait_s, configuration.retry_longest_s)
+        missed_s += wait_s if answer["state"] == MISSING else 0.0
+        wait_s = min(2 * wait_s, configuration.retry_longest_s)
     return answer
 
 
@@ -140,9 +141,8 @@ def _guarded(tools: DrawingTools, item: Record, work: Work) -> Record:
 
 
 def _fetch(tools: DrawingTools, item: Record) -> Record:
-    if tools.desk.fetch(item["object"], item["rule"]):
-        return {"state": DONE}
-    return {"state": MISSING, "reason": "The images that the drawing refers to are not in the archive."}
+    gap = tools.desk.fetch(item["object"], item["rule"])
+    return {"state": DONE} if gap is None else {"state": MISSING, "reason": gap}
 
 
 def _reconstruct(tools: DrawingTools, item: Record, check: Check) -> Record:
@@ -167,7 +167,8 @@ def _deliver(tools: DrawingTools, item: Record, archive: str) -> Record:
 
 
 def _quarantine(tools: DrawingTools, item: Record, reason: str) -> Record:
-    tools.desk.set_aside(item["object"], reason)
+    # Drawings that were accepted by earlier releases have no name of their own: there was one job of each.
+    tools.desk.set_aside(item["object"], item.get("drawing", item["object"]), reason)
     tools.log.warning("object quarantined", job=item["object"], reason=reason)
     return {}
 

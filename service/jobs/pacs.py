@@ -1,6 +1,5 @@
 """The job of drawings, wired from the settings of a worker."""
 
-from functools import partial
 from pathlib import Path
 
 from service.adapters.image_guard import ImageLimits
@@ -25,6 +24,6 @@ def pacs_kinds(settings: Settings, file: Path, registry: Catalogue, blobs: BlobS
     silence_libraries()
     configuration = load_configuration(file)
     audit = audit_trail(configuration, settings)
-    desk = Desk(configuration, blobs, audit, partial(open_archive, blobs=blobs), title_of(configuration))
+    desk = Desk(configuration, blobs, audit, open_archive, title_of(configuration))
     limits = ImageLimits(max_bytes=settings.max_body_bytes, max_voxels=settings.max_voxels)
     return (drawing_kind(DrawingTools(desk, registry, limits, program_version(), log)),)

@@ -17,8 +17,8 @@ PATH = "/dicom-web/studies"
 MEDIA_TYPE = "application/dicom+json"
 #: Who sent what came this way, in rules and in the audit trail.
 SENDER = "STOW-RS"
-#: Failure reason of an object that cannot be understood (PS3.18, table I.2-1).
-CANNOT_UNDERSTAND, PROCESSING_FAILURE = 0xC000, 0x0110
+#: Failure reasons of an object (PS3.18, I.2.2): not understood; not kept; not what the request says that it is.
+CANNOT_UNDERSTAND, PROCESSING_FAILURE, DOES_NOT_MATCH = 0xC000, 0x0110, 0xA900
 
 
 def receiver_of(request: Request) -> ObjectReceiver:
@@ -74,8 +74,12 @@ async def store_instances(
 
     What no rule takes is acknowledged and left alone.
     """
+    return await _store(request, receiver, boundary, None)
+
+
+async def _store(request: Request, receiver: ObjectReceiver, boundary: bytes, study: str | None) -> Response:
     objects = await parts_of(request, boundary)
-    receipts = [await run_in_threadpool(_receive, receiver, found) for found in objects]
+    receipts = [await run_in_threadpool(_receive, receiver, found, study) for found in objects]
     taken = [r for r in receipts if r.disposition in (Disposition.ACCEPTED, Disposition.LEFT_ALONE)]
     status = 200 if len(taken) == len(receipts) > 0 else 202 if taken else 409
     return JSONResponse(response_module(receipts), status, media_type=MEDIA_TYPE)
@@ -83,12 +87,12 @@ async def store_instances(
 
 async def store_study_instances(
     request: Request,
-    study: str,  # noqa: ARG001 - objects carry their study themselves
+    study: str,
     receiver: Annotated[ObjectReceiver, Depends(receiver_of)],
     boundary: Annotated[bytes, Depends(boundary_of)],
 ) -> Response:
-    """As without a study in the path; the objects say themselves which study they are of."""
-    return await store_instances(request, receiver, boundary)
+    """As without a study in the path; objects of other studies are refused (failure reason A900)."""
+    return await _store(request, receiver, boundary, study)
 
 
 async def parts_of(request: Request, boundary: bytes) -> list[bytes]:
@@ -124,7 +128,11 @@ def response_module(receipts: list[Receipt]) -> dict[str, Any]:
             "00081150": {"vr": "UI", "Value": [receipt.sop_class]},
             "00081155": {"vr": "UI", "Value": [receipt.sop_instance]},
         }
-        reason = {Disposition.QUARANTINED: CANNOT_UNDERSTAND, Disposition.FAILED: PROCESSING_FAILURE}
+        reason = {
+            Disposition.QUARANTINED: CANNOT_UNDERSTAND,
+            Disposition.MISPLACED: DOES_NOT_MATCH,
+            Disposition.FAILED: PROCESSING_FAILURE,
+        }
         failed = reason.get(receipt.disposition)
         if failed is None:
             groups.setdefault("00081199", []).append(item)
@@ -133,8 +141,8 @@ def response_module(receipts: list[Receipt]) -> dict[str, Any]:
     return {tag: {"vr": "SQ", "Value": items} for tag, items in groups.items()}
 
 
-def _receive(receiver: ObjectReceiver, data: bytes) -> Receipt:
+def _receive(receiver: ObjectReceiver, data: bytes, study: str | None) -> Receipt:
     try:
-        return receiver.receive(data, SENDER)
+        return receiver.receive(data, SENDER, study)
     except OSError:
         return Receipt(Disposition.FAILED)

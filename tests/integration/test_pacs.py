@@ -1,6 +1,5 @@
 """Drawings and results between a real archive (Orthanc) and the job, by every way that the service speaks."""
 
-import json
 import os
 import subprocess
 import sys
@@ -12,15 +11,23 @@ import pytest
 
 from benchmarks.pacs.orthanc import is_installed
 from benchmarks.ports import free_ports
-from service.adapters.blobs import FolderBlobs
 from service.adapters.dicom.results import RESULTS
 from service.adapters.pacs.archives import open_archive
 from service.adapters.pacs.audit import broken_line
 from service.adapters.pacs.configuration import Archive
-from service.adapters.pacs.inbox import QUARANTINE
 from service.pacs_ports import Disposition
 from tests.dicom_parts import PATIENT_ID, PATIENT_NAME, file_bytes, mr_series, reread, ring, rtstruct_of, seg_of
-from tests.pacs_parts import PATIENCE_S, by_dicomweb, by_get, by_move, new_study, results_in, service_with
+from tests.pacs_parts import (
+    PATIENCE_S,
+    by_dicomweb,
+    by_get,
+    by_move,
+    drawn_series,
+    new_study,
+    put_images,
+    results_in,
+    service_with,
+)
 from tests.service_parts import sparse_ellipsoid
 
 pytestmark = [
@@ -49,8 +56,11 @@ def test_a_drawing_becomes_results_in_its_study(way, orthanc, tmp_path):
 
 def test_images_come_by_c_move(orthanc, ports, tmp_path):
     images, _ = new_study(orthanc, tmp_path)
-    archive = open_archive(by_move(orthanc, ports.own), FolderBlobs(tmp_path / "files"))
-    found = archive.images(images[0].StudyInstanceUID, images[0].SeriesInstanceUID)
+    retrieval = open_archive(by_move(orthanc, ports.own)).images(
+        images[0].StudyInstanceUID, images[0].SeriesInstanceUID
+    )
+    found = retrieval.images
+    assert retrieval.failed == 0
     assert {image.SOPInstanceUID for image in found} == {image.SOPInstanceUID for image in images}
     assert all("PixelData" not in image for image in found)
 
@@ -146,9 +156,45 @@ def test_images_may_come_after_the_drawing_but_not_for_ever(way, orthanc, tmp_pa
     service.inbox.receive(file_bytes(drawing), "VIEWER")
     with service.working():
         service.until_empty()
-    assert service.inbox.quarantined() == 1
-    (reason,) = [key for key in service.blobs.list(f"{QUARANTINE}/") if key.endswith("reason.json")]
-    assert "not in the archive" in json.loads(service.blobs.get(reason))["reason"]
+    assert service.reasons() == ["26 of the 26 images that the drawing refers to are not in the archive."]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_nothing_is_made_of_half_a_series(way, orthanc, tmp_path):
+    images, drawing = drawn_series()
+    put_images(orthanc, tmp_path, images[:18])
+    service = service_with(tmp_path, WAYS[way](orthanc))
+    service.inbox.receive(file_bytes(drawing), "VIEWER")
+    with service.working():
+        time.sleep(2)
+        assert service.inbox.backlog() == 1
+        assert results_in(orthanc, images[0].StudyInstanceUID) == []
+        put_images(orthanc, tmp_path, images[18:])
+        service.until_empty()
+    results = results_in(orthanc, images[0].StudyInstanceUID)
+    assert len(results) == len(RESULTS)
+    assert {int(found.NumberOfFrames) for found in results if found.Modality == "OT"} == {len(images)}
+
+
+def test_a_drawing_in_quarantine_is_released_when_it_is_sent_again(orthanc, tmp_path):
+    images, drawing = drawn_series()
+    put_images(orthanc, tmp_path, images[:5] + images[9:])
+    service = service_with(tmp_path, by_dicomweb(orthanc))
+    service.configuration = service.configuration.model_copy(update={"images_awaited_s": 0.3})
+    service.inbox.receive(file_bytes(drawing), "VIEWER")
+    with service.working():
+        service.until_empty()
+        service.inbox.receive(file_bytes(drawing), "VIEWER")  # still too early
+        service.until_empty()
+        assert service.reasons() == ["4 of the 26 images that the drawing refers to are not in the archive."]
+        put_images(orthanc, tmp_path, images[5:9])
+        assert service.inbox.receive(file_bytes(drawing), "VIEWER").disposition is Disposition.ACCEPTED
+        assert service.inbox.quarantined() == 0
+        service.until_empty()
+        assert service.inbox.quarantined() == 0
+        service.inbox.receive(file_bytes(drawing), "VIEWER")  # once more, after the results
+        assert service.inbox.backlog() == 0
+    assert len(results_in(orthanc, images[0].StudyInstanceUID)) == len(RESULTS)
 
 
 def test_broken_objects_go_to_quarantine_with_the_reason(orthanc, tmp_path):

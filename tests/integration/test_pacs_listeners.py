@@ -12,23 +12,32 @@ from pathlib import Path
 
 import httpx
 import pytest
-from pydicom import dcmread
+from pydicom import Dataset, dcmread
+from pydicom.encaps import encapsulate
+from pydicom.uid import JPEG2000Lossless, MRImageStorage
 from pynetdicom import AE
 
 from benchmarks.pacs.orthanc import is_installed, send
 from benchmarks.ports import free_ports
-from service.adapters.pacs.configuration import Archive, Listener, Tls
+from service.adapters.dicom.results import RESULTS
+from service.adapters.pacs import sop_classes
+from service.adapters.pacs.commitment import Report, Requests
+from service.adapters.pacs.configuration import Archive, Listener, MoveDestination, Tls
 from service.adapters.pacs.dimse_client import DimseArchive
 from service.adapters.pacs.dimse_server import dimse_listener
 from service.adapters.pacs.inbox import INBOX, OBJECT
 from tests.dicom_parts import file_bytes, mr_series
+from tests.pacs_archives import TITLE, FakeArchive
 from tests.pacs_parts import (
     Service,
     by_dicomweb,
     by_get,
+    drawn_series,
     new_study,
     replace_archive,
+    results_in,
     service_with,
+    until,
 )
 from tests.service_parts import app_for, running
 
@@ -82,12 +91,29 @@ def test_storescu_is_acknowledged_when_the_object_is_on_disk(orthanc, tmp_path):
 def test_storage_commitment_is_asked_for_and_reported(orthanc, ports, tmp_path):
     images, _ = new_study(orthanc, tmp_path)
     service = service_with(tmp_path, by_dicomweb(orthanc))
-    archive = DimseArchive(replace_archive(by_get(orthanc), commitment=True), service.blobs)
+    archive = DimseArchive(replace_archive(by_get(orthanc), commitment=True))
+    unknown = mr_series()[:1]
+    reports = {}
     with listening(service, Listener(port=ports.own, calling_ae_titles=("ORTHANC",))):
-        assert archive.holds(images[:3])
-        unknown = mr_series()[:1]
-        assert not archive.holds(unknown)
+        for name, objects in {"held": images[:3], "unknown": unknown, "mixed": images[:2] + unknown}.items():
+            requests = Requests(service.blobs, name)
+            archive.ask_commitment(objects, requests.begin())
+            until(requests.report)
+            reports[name] = requests.report()
+    lost = frozenset({str(unknown[0].SOPInstanceUID)})
+    assert reports == {"held": Report(), "unknown": Report(lost), "mixed": Report(lost)}
+    assert archive.lacking(images[:2] + unknown) == unknown
     assert archive.echo()
+
+
+def test_results_go_to_an_archive_that_commits_itself(orthanc, ports, tmp_path):
+    images, drawing = new_study(orthanc, tmp_path)
+    service = service_with(tmp_path, replace_archive(by_get(orthanc), commitment=True))
+    service.inbox.receive(file_bytes(drawing), "VIEWER")
+    with listening(service, Listener(port=ports.own, calling_ae_titles=("ORTHANC",))), service.working():
+        service.until_empty()
+    assert len(results_in(orthanc, images[0].StudyInstanceUID)) == len(RESULTS)
+    assert list(service.blobs.list("dicom/commitments/")) == []
 
 
 @pytest.fixture
@@ -107,7 +133,7 @@ def test_associations_over_tls_need_a_certificate(orthanc, tmp_path, certificate
     (port,) = free_ports(1)
     with listening(service, Listener(port=port, calling_ae_titles=("MORPHOFLOW",), tls=certificates)):
         peer = Archive(name="peer", ae_title="MORPHOFLOW", port=port, tls=certificates)
-        assert DimseArchive(peer, service.blobs).echo()
+        assert DimseArchive(peer).echo()
         assert not associate(port, "MORPHOFLOW").is_established
         bare = ssl.create_default_context(cafile=str(certificates.authorities))
         stranger = associate(port, "MORPHOFLOW", tls_args=(bare, "127.0.0.1"))
@@ -117,6 +143,83 @@ def test_associations_over_tls_need_a_certificate(orthanc, tmp_path, certificate
     del stranger
     time.sleep(1)  # the library's threads let go of the refused sockets
     gc.collect()
+
+
+def sent_to(port: int, caller: str, called: str, images, **more) -> list[int | None]:
+    """Status of each image; none when the association was not accepted."""
+    entity = AE(ae_title=caller)
+    entity.add_requested_context(MRImageStorage)
+    peer = entity.associate("127.0.0.1", port, ae_title=called, **more)
+    statuses = [peer.send_c_store(image).get("Status") for image in images] if peer.is_established else []
+    peer.release()
+    return statuses
+
+
+def test_moved_images_are_those_that_were_asked_for():
+    images, others = mr_series(), mr_series(patient="OTHER")
+    (port,) = free_ports(1)
+    answers = []
+
+    def meanwhile() -> None:
+        answers.append(sent_to(port, "STRANGER", "MORPHOMOVE", others[:1]))
+        answers.append(sent_to(port, TITLE, "ANOTHER", others[:1]))
+        answers.append(sent_to(port, TITLE, "MORPHOMOVE", [others[0], images[0], images[0]]))
+
+    archive = FakeArchive(images, destination=MoveDestination(ae_title="MORPHOMOVE", port=port))
+    archive.before_moving = meanwhile
+    with archive.running():
+        found = DimseArchive(archive.settings()).images(images[0].StudyInstanceUID, images[0].SeriesInstanceUID)
+    assert answers == [[], [], [0x0124, 0, 0]]
+    assert sorted(image.SOPInstanceUID for image in found.images) == sorted(image.SOPInstanceUID for image in images)
+    assert found.failed == 0
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the library's refused socket
+def test_images_are_moved_over_tls_where_the_archive_has_it(certificates):
+    images = mr_series()
+    (port,) = free_ports(1)
+    bare = []
+    destination = MoveDestination(ae_title="MORPHOMOVE", port=port)
+    archive = FakeArchive(images, destination=destination, tls=certificates)
+    archive.before_moving = lambda: bare.append(sent_to(port, TITLE, "MORPHOMOVE", images[:1]))
+    with archive.running():
+        found = DimseArchive(archive.settings()).images(images[0].StudyInstanceUID, images[0].SeriesInstanceUID)
+    assert bare == [[]]
+    assert len(found.images) == len(images)
+    time.sleep(1)  # the library's threads let go of the refused sockets
+    gc.collect()
+
+
+def compressed(image: Dataset) -> Dataset:
+    """As an archive keeps it; the pixels are none."""
+    found = dcmread(io.BytesIO(file_bytes(image)))
+    found.file_meta.TransferSyntaxUID = JPEG2000Lossless
+    found.PixelData = encapsulate([b"\0" * 10])
+    found["PixelData"].is_undefined_length = True
+    return found
+
+
+def test_an_archive_may_forward_whatever_comes(tmp_path):
+    images, drawing = drawn_series()
+    service = service_with(tmp_path, FakeArchive([]).settings())
+    (port,) = free_ports(1)
+    files = [tmp_path / f"{number}.dcm" for number in range(2)]
+    for file, found in zip(files, (images[0], drawing), strict=True):
+        file.write_bytes(file_bytes(found))
+    entity = AE("PACS")
+    entity.add_requested_context(MRImageStorage, JPEG2000Lossless)
+    for uid in sop_classes.SENT:
+        entity.add_requested_context(uid)
+    with listening(service, Listener(port=port, calling_ae_titles=("PACS",))):
+        send(files, port, "MORPHOFLOW", "PACS")  # ends at the first object that is refused
+        peer = entity.associate("127.0.0.1", port, ae_title="MORPHOFLOW")
+        assert {context.abstract_syntax for context in peer.rejected_contexts} == set()
+        assert peer.send_c_store(compressed(images[1])).Status == 0
+        peer.release()
+    assert service.inbox.backlog() == 1
+    assert service.inbox.quarantined() == 0
+    assert len(list(service.blobs.list("dicom/"))) == 2  # the drawing, and what its job is to do
+    assert service.said.getvalue().count("left alone") == 2
 
 
 @pytest.fixture
@@ -154,6 +257,32 @@ def test_stow_answers_for_each_object(orthanc, tmp_path, pacs_file):
         )
         assert torn.status_code == 415
         assert client.post("/dicom-web/studies", json={}).status_code == 415
+
+
+def test_stow_keeps_nothing_of_what_is_no_drawing(tmp_path, pacs_file):
+    images, _ = drawn_series()
+    with running(app_for(tmp_path, pacs_file=pacs_file)) as client:
+        answer = stow(client, file_bytes(compressed(images[0])))
+        assert answer.status_code == 200
+        assert answer.json()["00081199"]["Value"][0]["00081155"]["Value"] == [images[0].SOPInstanceUID]
+        assert "morphoflow_dicom_quarantined 0.0" in client.get("/metrics").text
+
+
+def test_stow_refuses_objects_of_another_study(tmp_path, pacs_file):
+    images, drawing = drawn_series()
+    _, other = drawn_series()
+    path = f"/dicom-web/studies/{drawing.StudyInstanceUID}"
+    with running(app_for(tmp_path, pacs_file=pacs_file)) as client:
+        answer = stow(client, file_bytes(other), file_bytes(compressed(mr_series()[0])), path=path)
+        assert answer.status_code == 409
+        failed = answer.json()["00081198"]["Value"]
+        assert [item["00081197"]["Value"] for item in failed] == [[0xA900], [0xA900]]
+        assert failed[0]["00081155"]["Value"] == [other.SOPInstanceUID]
+        assert "morphoflow_dicom_backlog 0.0" in client.get("/metrics").text
+        assert "morphoflow_dicom_quarantined 0.0" in client.get("/metrics").text
+        assert stow(client, file_bytes(drawing), file_bytes(other), path=path).status_code == 202
+        assert stow(client, file_bytes(images[0]), path=path).status_code == 200
+        until(lambda: "morphoflow_dicom_backlog 1.0" in client.get("/metrics").text)  # figures may be seconds old
 
 
 def test_without_the_file_nothing_is_taken(tmp_path):

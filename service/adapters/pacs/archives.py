@@ -3,10 +3,9 @@
 from service.adapters.pacs.configuration import Archive
 from service.adapters.pacs.dicomweb import DicomWebArchive
 from service.adapters.pacs.dimse_client import DimseArchive
-from service.job_ports import BlobStore
 from service.pacs_ports import PictureArchive
 
 
-def open_archive(archive: Archive, blobs: BlobStore) -> PictureArchive:
+def open_archive(archive: Archive) -> PictureArchive:
     """The archive; nothing is sent yet."""
-    return DicomWebArchive(archive) if archive.dicomweb is not None else DimseArchive(archive, blobs)
+    return DicomWebArchive(archive) if archive.dicomweb is not None else DimseArchive(archive)

@@ -62,6 +62,7 @@ class Archive(_Closed):
     tls: Tls | None = Field(None, description="TLS with an own certificate (DIMSE and DICOMweb)")
     move: MoveDestination | None = Field(None, description="fetch by C-MOVE to here; by C-GET when left out")
     commitment: bool = Field(False, description="ask for storage commitment (DIMSE)")
+    commitment_awaited_s: float = Field(3600.0, gt=0, description="wait for its report before it is asked again")
     timeout_s: float = Field(30.0, gt=0, description="longest wait for an answer (s)")
 
     @model_validator(mode="after")

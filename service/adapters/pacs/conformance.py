@@ -21,8 +21,11 @@ SECTIONS: dict[str, type[BaseModel]] = {
 
 def network_table() -> str:
     """SOP classes, roles and transfer syntaxes of DIMSE."""
-    rows = [(_name(sop_classes.VERIFICATION), sop_classes.VERIFICATION, "yes", "yes", "proposed")]
+    rows: list[Sequence[object]] = [
+        (_name(sop_classes.VERIFICATION), sop_classes.VERIFICATION, "yes", "yes", "proposed")
+    ]
     rows += [(_name(uid), uid, "", "yes", "accepted") for uid in sop_classes.RECEIVED]
+    rows += [("every other storage class of PS3.4, B.5", "", "", "left alone", "accepted, and those of images")]
     rows += [(_name(uid), uid, "yes", "", "proposed") for uid in sop_classes.SENT]
     rows += [(_name(uid), uid, "", "by C-GET, C-MOVE", "proposed") for uid in sop_classes.IMAGES]
     query = (sop_classes.FIND, sop_classes.GET, sop_classes.MOVE, sop_classes.COMMITMENT)
@@ -31,11 +34,12 @@ def network_table() -> str:
 
 
 def syntax_table() -> str:
-    """Transfer syntaxes that are accepted and proposed."""
+    """Transfer syntaxes that are accepted and proposed; those of images for what is left alone."""
+    images = [uid for uid in sop_classes.LEFT_ALONE_SYNTAXES if uid not in sop_classes.ACCEPTED_SYNTAXES]
     rows = [
-        (uid.name, uid, _mark(uid in sop_classes.ACCEPTED_SYNTAXES), _mark(uid in sop_classes.PROPOSED_SYNTAXES))
-        for uid in sop_classes.ACCEPTED_SYNTAXES
+        (uid.name, uid, "yes", _mark(uid in sop_classes.PROPOSED_SYNTAXES)) for uid in sop_classes.ACCEPTED_SYNTAXES
     ]
+    rows += [(uid.name, uid, "of images", "") for uid in images]
     return _table(("transfer syntax", "UID", "accepted", "proposed"), rows)
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,12 +14,18 @@ from pydicom import Dataset, dcmread
 from service.adapters.dicom.masks import referenced_series
 from service.adapters.dicom.objects import quiet, read_object
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail
+from service.adapters.pacs.commitment import Report, Requests
 from service.adapters.pacs.configuration import Archive, PacsConfiguration
 from service.adapters.pacs.inbox import IMAGES, INBOX, OBJECT, quarantine
+from service.adapters.pacs.references import referenced_images
+from service.errors import ArchiveUnavailable
 from service.job_ports import BlobStore
-from service.pacs_ports import PictureArchive
+from service.pacs_ports import PictureArchive, Retrieval
 
-RESULTS = "results"
+#: Beside a drawing: its results, and how far archives are that commit themselves to them.
+RESULTS, DELIVERIES = "results", "deliveries"
+#: Wait for a report that comes at once, and between two looks for it (s); later ones are for the turns to come.
+PROMPT_REPORT_S, LOOK_S = 2.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -28,6 +35,7 @@ class Desk:
     Attributes:
         open_archive: connects to one.
         title: of this program in the audit trail.
+        now_s: seconds since 1970.
     """
 
     configuration: PacsConfiguration
@@ -35,24 +43,26 @@ class Desk:
     audit: AuditTrail
     open_archive: Callable[[Archive], PictureArchive]
     title: str
+    now_s: Callable[[], float] = time.time
 
     def drawing(self, identifier: str) -> Dataset:
         """The object that was received."""
         return read_object(io.BytesIO(self.blobs.get(f"{INBOX}/{identifier}/{OBJECT}")), "object")
 
-    def fetch(self, identifier: str, rule: str) -> bool:
-        """Put the headers of the images beside the drawing; False when the archive has none of them yet."""
+    def fetch(self, identifier: str, rule: str) -> str | None:
+        """Put the headers of the images beside the drawing; or, while any is missing, a sentence that says so."""
         drawing, name = self.drawing(identifier), self.configuration.rule(rule).fetch_from
-        study = str(drawing.StudyInstanceUID)
+        study, series = str(drawing.StudyInstanceUID), str(referenced_series(drawing))
         with self._opened(name) as archive:
-            images = archive.images(study, str(referenced_series(drawing)))
-        if not images:
-            return False
+            found = archive.images(study, series)
+        gap = _gap(referenced_images(drawing, series), found)
+        if gap is not None:
+            return gap
         with quiet():
-            content = json.dumps([image.to_json_dict(suppress_invalid_tags=True) for image in images])
+            content = json.dumps([image.to_json_dict(suppress_invalid_tags=True) for image in found.images])
         self.blobs.put(f"{INBOX}/{identifier}/{IMAGES}", content.encode())
-        self.audit.write(AuditEntry(AuditEvent.FETCHED, name, self.title, study, _uids(images)))
-        return True
+        self.audit.write(AuditEntry(AuditEvent.FETCHED, name, self.title, study, _uids(found.images)))
+        return None
 
     def images(self, identifier: str) -> list[Dataset]:
         """The headers that were fetched."""
@@ -72,24 +82,52 @@ class Desk:
         with quiet():
             results = [dcmread(io.BytesIO(self.blobs.get(key))) for key in keys]
         with self._opened(archive) as opened:
-            if not opened.holds(results):
-                opened.store(results)
-                if not opened.holds(results):
-                    raise OSError("The archive does not show the results that it took.")
+            if opened.commits:
+                self._commit(opened, results, self._requests(identifier, archive), archive)
+            else:
+                _store(opened, results)
         study = str(results[0].StudyInstanceUID)
         self.audit.write(AuditEntry(AuditEvent.SENT, self.title, archive, study, _uids(results)))
         return [hashlib.sha256(str(found.SOPInstanceUID).encode()).hexdigest() for found in results]
 
     def forget(self, identifier: str) -> None:
         """Remove everything of a drawing whose results were given back."""
+        for key in list(self.blobs.list(f"{INBOX}/{identifier}/{DELIVERIES}/")):
+            Requests(self.blobs, key).forget()
         self.blobs.delete(f"{INBOX}/{identifier}/")
 
-    def set_aside(self, identifier: str, reason: str) -> None:
-        """Put a drawing in quarantine."""
+    def set_aside(self, identifier: str, name: str, reason: str) -> None:
+        """Put a drawing in quarantine under a name."""
         key = f"{INBOX}/{identifier}/{OBJECT}"
         if self.blobs.exists(key):
-            quarantine(self.blobs, identifier, self.blobs.get(key), reason)
+            quarantine(self.blobs, name, self.blobs.get(key), reason)
         self.forget(identifier)
+
+    def _commit(self, opened: PictureArchive, results: Sequence[Dataset], requests: Requests, archive: str) -> None:
+        """Have an archive commit itself; asked once for all, and again only when it fails or is silent for long.
+
+        Raises:
+            ArchiveUnavailable: it has not reported yet.
+        """
+        patience_s = self.configuration.archive(archive).commitment_awaited_s
+        report = requests.report()
+        if requests.progress.is_committed or (report is not None and report.is_success):
+            requests.end()
+            return
+        if report is not None or not requests.is_awaited(self.now_s(), patience_s):
+            lost = opened.lacking(results) if report is None else _failed(results, report)
+            if lost:
+                opened.store(lost)
+            opened.ask_commitment(results, requests.begin())
+            requests.sent(self.now_s())
+            if _comes_at_once(requests):
+                requests.end()
+                return
+        raise ArchiveUnavailable("The archive has not committed itself to the results yet.")
+
+    def _requests(self, identifier: str, archive: str) -> Requests:
+        name = hashlib.sha256(archive.encode()).hexdigest()
+        return Requests(self.blobs, f"{INBOX}/{identifier}/{DELIVERIES}/{name}.json")
 
     @contextmanager
     def _opened(self, name: str) -> Iterator[PictureArchive]:
@@ -98,6 +136,38 @@ class Desk:
             yield archive
         finally:
             archive.close()
+
+
+def _gap(wanted: frozenset[str], found: Retrieval) -> str | None:
+    """What is missing of the images; None when all have come."""
+    missing = wanted - {str(image.SOPInstanceUID) for image in found.images}
+    if missing:
+        return f"{len(missing)} of the {len(wanted)} images that the drawing refers to are not in the archive."
+    if found.failed:
+        return f"{found.failed} images of the series that the drawing refers to could not be sent by the archive."
+    return None if found.images else "The images that the drawing refers to are not in the archive."
+
+
+def _store(opened: PictureArchive, results: Sequence[Dataset]) -> None:
+    """Send what a query does not find, and make sure that it finds it then."""
+    lacking = opened.lacking(results)
+    if lacking:
+        opened.store(lacking)
+        if opened.lacking(lacking):
+            raise ArchiveUnavailable("The archive does not show the results that it took.")
+
+
+def _failed(results: Sequence[Dataset], report: Report) -> list[Dataset]:
+    return [found for found in results if report.failed is None or str(found.SOPInstanceUID) in report.failed]
+
+
+def _comes_at_once(requests: Requests) -> bool:
+    """Whether the archive reports its success while one waits."""
+    end = time.monotonic() + PROMPT_REPORT_S
+    while requests.report() is None and time.monotonic() < end:
+        time.sleep(LOOK_S)
+    report = requests.report()
+    return report is not None and report.is_success
 
 
 def _uids(objects: Sequence[Dataset]) -> list[tuple[str, str]]:

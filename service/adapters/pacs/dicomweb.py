@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import requests
@@ -11,9 +12,12 @@ from pydicom import Dataset
 from service.adapters.dicom.objects import quiet
 from service.adapters.pacs.configuration import Archive
 from service.errors import ArchiveRefused, ArchiveUnavailable
+from service.pacs_ports import Retrieval
 
 #: Answers after which the same request may succeed later.
 _PASSING = (408, 425, 429, 500, 502, 503, 504)
+#: Answers to credentials that have expired or are not known yet; those in the file are read anew each time.
+_UNAUTHORISED = (401, 403)
 
 
 class DicomWebArchive:
@@ -24,11 +28,16 @@ class DicomWebArchive:
         self._client = DICOMwebClient(archive.dicomweb or "", session=self._session)
         self._client.set_http_retry_params(retry=False)
 
-    def images(self, study: str, series: str) -> list[Dataset]:
+    @property
+    def commits(self) -> bool:
+        """Storage commitment is a service of DIMSE."""
+        return False
+
+    def images(self, study: str, series: str) -> Retrieval:
         """Headers of a series; none when the archive does not have it."""
         found = _or_nothing(partial(self._client.retrieve_series_metadata, study, series))
         with quiet():
-            return [Dataset.from_json(_without_bulk(item)) for item in found]
+            return Retrieval([Dataset.from_json(_without_bulk(item)) for item in found])
 
     def store(self, objects: Sequence[Dataset]) -> None:
         """Send objects of one study."""
@@ -37,12 +46,15 @@ class DicomWebArchive:
         if answer.get("FailedSOPSequence"):
             raise ArchiveRefused("The archive did not take a result.")
 
-    def holds(self, objects: Sequence[Dataset]) -> bool:
-        """Whether a query finds every one of the objects."""
-        wanted: dict[tuple[str, str], set[str]] = {}
-        for found in objects:
-            wanted.setdefault((found.StudyInstanceUID, found.SeriesInstanceUID), set()).add(found.SOPInstanceUID)
-        return all(instances <= self._instances(*place) for place, instances in wanted.items())
+    def lacking(self, objects: Sequence[Dataset]) -> list[Dataset]:
+        """Those of the objects that a query does not find."""
+        places = {(str(found.StudyInstanceUID), str(found.SeriesInstanceUID)) for found in objects}
+        held = set[str]().union(*(self._instances(*place) for place in places))
+        return [found for found in objects if str(found.SOPInstanceUID) not in held]
+
+    def ask_commitment(self, objects: Sequence[Dataset], transaction: str) -> None:
+        """Never asked for."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Let go of the connections."""
@@ -60,7 +72,7 @@ class _Session(requests.Session):
         super().__init__()
         self._timeout_s = archive.timeout_s
         if archive.authorization_file is not None:
-            self.headers["Authorization"] = archive.authorization_file.read_text(encoding="ascii").strip()
+            self.headers["Authorization"] = _credentials(archive.authorization_file)
         if archive.authorities is not None:
             self.verify = str(archive.authorities)
         if archive.tls is not None:
@@ -72,6 +84,14 @@ class _Session(requests.Session):
         return super().request(*arguments, **{"timeout": self._timeout_s, **options})
 
 
+def _credentials(file: Path) -> str:
+    """Content of a file that others may be renewing."""
+    try:
+        return file.read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        raise ArchiveUnavailable("The file with the archive's credentials cannot be read.") from None
+
+
 class _faults:  # noqa: N801 - reads as a statement
     """Failures of the network and the archive as errors of the project, without addresses."""
 
@@ -79,8 +99,10 @@ class _faults:  # noqa: N801 - reads as a statement
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         if isinstance(error, requests.HTTPError) and error.response is not None:
-            if error.response.status_code not in _PASSING:
-                status = error.response.status_code
+            status = error.response.status_code
+            if status in _UNAUTHORISED:
+                raise ArchiveUnavailable("The archive does not accept the credentials.") from None
+            if status not in _PASSING:
                 raise ArchiveRefused(f"The archive refused a request with status {status}.") from None
             raise ArchiveUnavailable("The archive cannot answer now.") from None
         if isinstance(error, requests.RequestException | OSError):

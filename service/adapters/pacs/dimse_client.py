@@ -1,55 +1,49 @@
-"""An archive behind DIMSE (PS3.4): C-GET or C-MOVE for images, C-STORE for results, C-FIND or storage commitment."""
+"""An archive behind DIMSE (PS3.4): C-GET or C-MOVE for images, C-STORE for results, C-FIND, storage commitment."""
 
-import hashlib
-import time
+import ssl
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 from pydicom import Dataset
-from pydicom.uid import generate_uid
 from pynetdicom import AE, StoragePresentationContexts, build_role, evt
 
 from service.adapters.dicom.objects import quiet
 from service.adapters.pacs import sop_classes
-from service.adapters.pacs.configuration import Archive
+from service.adapters.pacs.configuration import Archive, MoveDestination, Tls
 from service.adapters.pacs.prompt_sockets import PROMPT
-from service.adapters.pacs.tls import client_context
+from service.adapters.pacs.tls import client_context, server_context
 from service.errors import ArchiveRefused, ArchiveUnavailable
-from service.job_ports import BlobStore
+from service.pacs_ports import Retrieval
 
-#: Longest wait for the report of a storage commitment, and between two looks for it (s).
-COMMITMENT_S, LOOK_S = 20.0, 0.1
 PENDING = (0xFF00, 0xFF01)
-SUCCESS = 0x0000
-
-
-def commitment_key(transaction: str) -> str:
-    """Where the listener leaves the report of a storage commitment."""
-    return f"dicom/commitments/{hashlib.sha256(transaction.encode()).hexdigest()}/report"
+SUCCESS, SOME_FAILED, NOT_AUTHORISED = 0x0000, 0xB000, 0x0124
+#: Answers to a request for commitment (PS3.7, C): it has been made already; it may succeed later.
+DUPLICATE_TRANSACTION = 0x0131
+PROCESSING_FAILURE, RESOURCE_LIMITATION = 0x0110, 0x0213
 
 
 class DimseArchive:
-    """The `PictureArchive` behind DIMSE.
+    """The `PictureArchive` behind DIMSE."""
 
-    Args:
-        blobs: where the listener leaves reports of storage commitment.
-    """
-
-    def __init__(self, archive: Archive, blobs: BlobStore) -> None:
+    def __init__(self, archive: Archive) -> None:
         self._archive = archive
-        self._blobs = blobs
+
+    @property
+    def commits(self) -> bool:
+        """Whether the file asks for storage commitment."""
+        return self._archive.commitment
 
     def echo(self) -> bool:
         """Whether the archive answers (C-ECHO)."""
         with self._associated([sop_classes.VERIFICATION]) as peer:
             return bool(peer.send_c_echo().get("Status", -1) == SUCCESS)
 
-    def images(self, study: str, series: str) -> list[Dataset]:
+    def images(self, study: str, series: str) -> Retrieval:
         """Headers of a series; none when the archive does not have it."""
         query = Dataset()
         query.QueryRetrieveLevel, query.StudyInstanceUID, query.SeriesInstanceUID = "SERIES", study, series
-        return self._get(query) if self._archive.move is None else self._move(query)
+        return self._get(query) if self._archive.move is None else self._move(query, self._archive.move)
 
     def store(self, objects: Sequence[Dataset]) -> None:
         """Send objects."""
@@ -58,44 +52,74 @@ class DimseArchive:
                 status = peer.send_c_store(found).get("Status")
                 if status is None:
                     raise ArchiveUnavailable("The archive ended the association.")
+                if status & 0xFF00 == 0xA700:
+                    raise ArchiveUnavailable("The archive has no room for the results now.")
                 if status != SUCCESS and status & 0xF000 != 0xB000:
                     raise ArchiveRefused(f"The archive refused a result with status {status:04X}.")
 
-    def holds(self, objects: Sequence[Dataset]) -> bool:
-        """Whether the archive is committed to every one of the objects, or a query finds it."""
-        if self._archive.commitment:
-            return self._is_committed(objects)
-        with self._associated([sop_classes.FIND]) as peer:
-            return all(self._finds(peer, found) for found in objects)
+    def lacking(self, objects: Sequence[Dataset]) -> list[Dataset]:
+        """Those of the objects that a query does not find; all, when an archive that commits itself takes no query."""
+        with self._associated([sop_classes.VERIFICATION, sop_classes.FIND]) as peer:
+            accepted = {context.abstract_syntax for context in peer.accepted_contexts}
+            if self.commits and sop_classes.FIND not in accepted:
+                return list(objects)
+            return [found for found in objects if not self._finds(peer, found)]
+
+    def ask_commitment(self, objects: Sequence[Dataset], transaction: str) -> None:
+        """N-ACTION; the archive reports later, to the listener."""
+        request = Dataset()
+        request.TransactionUID = transaction
+        request.ReferencedSOPSequence = []
+        for found in objects:
+            item = Dataset()
+            item.ReferencedSOPClassUID, item.ReferencedSOPInstanceUID = found.SOPClassUID, found.SOPInstanceUID
+            request.ReferencedSOPSequence.append(item)
+        with self._associated([sop_classes.COMMITMENT]) as peer:
+            answer, _ = peer.send_n_action(request, 1, sop_classes.COMMITMENT, sop_classes.COMMITMENT_INSTANCE)
+        status = answer.get("Status")
+        if status in (None, PROCESSING_FAILURE, RESOURCE_LIMITATION):
+            raise ArchiveUnavailable("The archive cannot take a request for storage commitment now.")
+        if status not in (SUCCESS, DUPLICATE_TRANSACTION):
+            raise ArchiveRefused("The archive refused to commit itself to the results.")
 
     def close(self) -> None:
         """Nothing is held open."""
 
-    def _get(self, query: Dataset) -> list[Dataset]:
-        found: list[Dataset] = []
-        handlers = [(evt.EVT_C_STORE, _collect(found))]
+    def _get(self, query: Dataset) -> Retrieval:
+        found: dict[str, Dataset] = {}
+        handlers = [(evt.EVT_C_STORE, _collect(found, query))]
         roles = [build_role(uid, scp_role=True) for uid in sop_classes.IMAGES]
         contexts = [sop_classes.FIND, sop_classes.GET, *sop_classes.IMAGES]
+        failed = 0
         with self._associated(contexts, roles=roles, handlers=handlers) as peer:
             if self._matches(peer, query):  # archives fail to get what they do not have
-                _finish(peer.send_c_get(query, sop_classes.GET))
-        return found
+                failed = _failures(peer.send_c_get(query, sop_classes.GET))
+        return Retrieval(list(found.values()), failed)
 
-    def _move(self, query: Dataset) -> list[Dataset]:
-        target = self._archive.move
-        assert target is not None
-        found: list[Dataset] = []
+    def _move(self, query: Dataset, target: MoveDestination) -> Retrieval:
+        found: dict[str, Dataset] = {}
+        failed = 0
+        contexts = [sop_classes.FIND, sop_classes.MOVE]
+        with self._receiving(target, _collect(found, query)), self._associated(contexts) as peer:
+            if self._matches(peer, query):
+                failed = _failures(peer.send_c_move(query, target.ae_title, sop_classes.MOVE))
+        return Retrieval(list(found.values()), failed)
+
+    @contextmanager
+    def _receiving(self, target: MoveDestination, handler: Callable[[Any], int]) -> Iterator[None]:
+        """The port that images are moved to is open for the archive, and for it alone."""
         entity: Any = AE(ae_title=target.ae_title)
-        entity.supported_contexts = StoragePresentationContexts
-        handlers = [PROMPT, (evt.EVT_C_STORE, _collect(found))]
-        server = entity.start_server((target.host, target.port), block=False, evt_handlers=handlers)
+        entity.require_called_aet = True
+        entity.require_calling_aet = [self._archive.ae_title]
+        for context in StoragePresentationContexts:
+            entity.add_supported_context(context.abstract_syntax, list(sop_classes.PROPOSED_SYNTAXES))
+        secure = None if self._archive.tls is None else _readable(server_context, self._archive.tls)
+        handlers = [PROMPT, (evt.EVT_C_STORE, handler)]
+        server = entity.start_server((target.host, target.port), block=False, ssl_context=secure, evt_handlers=handlers)
         try:
-            with self._associated([sop_classes.FIND, sop_classes.MOVE]) as peer:
-                if self._matches(peer, query):
-                    _finish(peer.send_c_move(query, target.ae_title, sop_classes.MOVE))
+            yield
         finally:
             server.shutdown()
-        return found
 
     def _finds(self, peer: Any, found: Dataset) -> bool:
         query = Dataset()
@@ -110,31 +134,6 @@ class DimseArchive:
             raise ArchiveUnavailable("The archive did not answer a query.")
         return any(status.get("Status") in PENDING for status, _ in answers)
 
-    def _is_committed(self, objects: Sequence[Dataset]) -> bool:
-        request = Dataset()
-        request.TransactionUID = generate_uid()
-        request.ReferencedSOPSequence = []
-        for found in objects:
-            item = Dataset()
-            item.ReferencedSOPClassUID, item.ReferencedSOPInstanceUID = found.SOPClassUID, found.SOPInstanceUID
-            request.ReferencedSOPSequence.append(item)
-        key = commitment_key(request.TransactionUID)
-        with self._associated([sop_classes.COMMITMENT]) as peer:
-            status, _ = peer.send_n_action(request, 1, sop_classes.COMMITMENT, sop_classes.COMMITMENT_INSTANCE)
-            if status.get("Status") != SUCCESS:
-                raise ArchiveRefused("The archive refused to commit itself to the results.")
-        return self._report(key) == b"committed"
-
-    def _report(self, key: str) -> bytes:
-        end = time.monotonic() + COMMITMENT_S
-        while time.monotonic() < end:
-            if self._blobs.exists(key):
-                report = self._blobs.get(key)
-                self._blobs.delete(f"{key.rpartition(chr(47))[0]}/")
-                return report
-            time.sleep(LOOK_S)
-        raise ArchiveUnavailable("The archive has not reported on its storage commitment.")
-
     @contextmanager
     def _associated(self, contexts: Sequence[str], **more: Any) -> Iterator[Any]:
         entity: Any = AE(ae_title=self._archive.local_ae_title)
@@ -144,7 +143,7 @@ class DimseArchive:
             entity.add_requested_context(context, list(sop_classes.PROPOSED_SYNTAXES))
         options = {"ext_neg": more.get("roles"), "evt_handlers": [PROMPT, *(more.get("handlers") or [])]}
         if self._archive.tls is not None:
-            options["tls_args"] = (client_context(self._archive.tls), self._archive.host)
+            options["tls_args"] = (_readable(client_context, self._archive.tls), self._archive.host)
         peer = entity.associate(
             self._archive.host, self._archive.port, ae_title=self._archive.ae_title or "ANY-SCP", **options
         )
@@ -152,27 +151,50 @@ class DimseArchive:
             raise ArchiveUnavailable("The archive cannot be reached or does not accept the association.")
         try:
             yield peer
+        except RuntimeError:  # what the library says of an association that has ended meanwhile
+            raise ArchiveUnavailable("The archive ended the association.") from None
+        except ValueError:  # and of a class that was not accepted in it
+            raise ArchiveRefused("The archive does not accept a class of objects or a service.") from None
         finally:
             peer.release()
 
 
-def _collect(found: list[Dataset]) -> Callable[[Any], int]:
+def _readable(context: Callable[[Tls], ssl.SSLContext], tls: Tls) -> ssl.SSLContext:
+    """TLS with certificates from files that others may be renewing."""
+    try:
+        return context(tls)
+    except OSError:
+        raise ArchiveUnavailable("The certificates for the archive cannot be read.") from None
+
+
+def _collect(found: dict[str, Dataset], query: Dataset) -> Callable[[Any], int]:
+    """Keeps images of the series that was asked for, each once and without pixels."""
+    wanted = (query.StudyInstanceUID, query.SeriesInstanceUID)
+
     def keep(event: Any) -> int:
         with quiet():
             image = event.dataset
+            if (image.get("StudyInstanceUID"), image.get("SeriesInstanceUID")) != wanted:
+                return NOT_AUTHORISED
             for tag in [tag for tag in image.keys() if tag.group == 0x7FE0]:  # noqa: SIM118 - not a mapping
                 del image[tag]
             image.file_meta = event.file_meta
-        found.append(image)
+            found.setdefault(str(image.SOPInstanceUID), image)
         return SUCCESS
 
     return keep
 
 
-def _finish(answers: Iterator[tuple[Dataset, Dataset | None]]) -> None:
-    """Read the answers to the last; `ArchiveUnavailable` when it is a failure."""
-    last = None
+def _failures(answers: Iterator[tuple[Dataset, Dataset | None]]) -> int:
+    """Read the answers to the last: how many images the archive could not send.
+
+    Raises:
+        ArchiveUnavailable: it sent none, or ended the association.
+    """
+    last = Dataset()
     for status, _ in answers:
-        last = status.get("Status")
-    if last is None or (last != SUCCESS and last != 0xB000):
+        last = status
+    if last.get("Status") not in (SUCCESS, SOME_FAILED):
         raise ArchiveUnavailable("The archive did not send the images.")
+    failed = int(last.get("NumberOfFailedSuboperations") or 0)
+    return max(failed, 1) if last.Status == SOME_FAILED else failed

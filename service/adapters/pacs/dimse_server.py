@@ -1,4 +1,4 @@
-"""The DIMSE listener: C-ECHO, C-STORE of drawings, storage commitment, reports of commitment that was asked for.
+"""The DIMSE listener: C-ECHO, C-STORE of drawings and of what is left alone, reports of storage commitment.
 
 An object is acknowledged when it is on disk and in a durable job, never before.
 """
@@ -9,12 +9,13 @@ from typing import Any
 
 from pydicom import Dataset
 from pynetdicom import AE, evt
+from pynetdicom.presentation import PresentationContext
 
 from service.adapters.dicom.objects import quiet
 from service.adapters.pacs import sop_classes
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome
+from service.adapters.pacs.commitment import Report, Reports
 from service.adapters.pacs.configuration import Listener
-from service.adapters.pacs.dimse_client import commitment_key
 from service.adapters.pacs.prompt_sockets import PROMPT
 from service.adapters.pacs.tls import server_context
 from service.job_ports import BlobStore
@@ -35,6 +36,8 @@ def dimse_listener(
     entity.add_supported_context(sop_classes.VERIFICATION)
     for uid in sop_classes.RECEIVED:
         entity.add_supported_context(uid, list(sop_classes.ACCEPTED_SYNTAXES))
+    for uid in sop_classes.LEFT_ALONE:
+        entity.add_supported_context(uid, list(sop_classes.LEFT_ALONE_SYNTAXES))
     entity.add_supported_context(sop_classes.COMMITMENT, scu_role=True, scp_role=True)
     desk = _Desk(listener, receiver, blobs, audit, log)
     handlers: list[Any] = [
@@ -46,7 +49,11 @@ def dimse_listener(
     ]
     context = None if listener.tls is None else server_context(listener.tls)
     server = entity.start_server(
-        (listener.host, listener.port), block=False, ssl_context=context, evt_handlers=handlers
+        (listener.host, listener.port),
+        block=False,
+        ssl_context=context,
+        evt_handlers=handlers,
+        contexts=_Shared(entity.supported_contexts),
     )
     log.info("DICOM listener started", tls=context is not None)
     try:
@@ -54,6 +61,13 @@ def dimse_listener(
     finally:
         server.shutdown()
         log.info("DICOM listener stopped")
+
+
+class _Shared(list[PresentationContext]):
+    """Contexts that associations read and do not change; to copy all of them takes 0.1 s for each association."""
+
+    def __deepcopy__(self, _: dict[int, Any]) -> "_Shared":
+        return self
 
 
 class _Desk:
@@ -64,7 +78,7 @@ class _Desk:
     ) -> None:
         self._title = listener.ae_title
         self._receiver = receiver
-        self._blobs = blobs
+        self._reports = Reports(blobs)
         self._audit = audit
         self._log = log
 
@@ -85,9 +99,12 @@ class _Desk:
         """N-EVENT-REPORT: what an archive says on the commitment that it was asked for."""
         with quiet():
             information: Dataset = event.event_information
-            key = commitment_key(str(information.TransactionUID))
-            failed = event.event_type != 1 or bool(information.get("FailedSOPSequence"))
-        self._blobs.put(key, b"failed" if failed else b"committed")
+            transaction = str(information.TransactionUID)
+            items = information.get("FailedSOPSequence") or []
+            failed = frozenset(str(item.ReferencedSOPInstanceUID) for item in items)
+        report = Report(failed if failed or event.event_type == 1 else None)
+        if not self._reports.take(transaction, report):
+            self._log.warning("report of a storage commitment that nobody awaits")
         return SUCCESS, None
 
     def rejected(self, event: Any) -> None:

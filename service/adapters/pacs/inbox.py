@@ -6,7 +6,9 @@ Files are named by digests: no name, number or date of a patient is in them.
 import hashlib
 import io
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 from pydicom import Dataset
@@ -15,9 +17,10 @@ from model.errors import InputError
 from service.adapters.dicom.objects import read_object, tolerant
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome
 from service.adapters.pacs.configuration import Rule
+from service.adapters.pacs.headers import Header, header_of
 from service.adapters.pacs.routing import Match, find_rule
 from service.errors import UnknownJob
-from service.job_ports import BlobStore, JobEngine
+from service.job_ports import BlobStore, JobEngine, JobStatus
 from service.pacs_ports import DRAWING_JOB, Disposition, Receipt
 
 INBOX, QUARANTINE = "dicom/inbox", "dicom/quarantine"
@@ -42,24 +45,23 @@ class Inbox:
     title: str
     log: Any
 
-    def receive(self, data: bytes, sender: str) -> Receipt:
+    def receive(self, data: bytes, sender: str, study: str | None = None) -> Receipt:
         """Take one object; see `ObjectReceiver`."""
-        digest = hashlib.sha256(data).hexdigest()
+        header, digest = header_of(data), hashlib.sha256(data).hexdigest()
+        if study is not None and header.study not in ("", study):
+            return self._misplaced(header, sender)
+        if header.is_foreign:
+            return self._taken(header, sender, None)
         try:
             found = read_object(io.BytesIO(data), "object")
             with tolerant("object"):
-                uids = str(found.SOPClassUID), str(found.SOPInstanceUID)
-                study = str(found.StudyInstanceUID)
+                named = (str(found.SOPClassUID), str(found.SOPInstanceUID), str(found.StudyInstanceUID))
             match = find_rule(self.rules, found, sender)
         except InputError as error:
             return self._quarantine(data, digest, sender, error)
-        disposition = Disposition.LEFT_ALONE if match is None else Disposition.ACCEPTED
         if match is not None:
             self._accept(data, drawing_digest(found, match), match)
-        note = "" if match else "No rule takes it; it was left alone."
-        self.audit.write(AuditEntry(AuditEvent.RECEIVED, sender, self.title, study, [uids], note=note))
-        self.log.info("object received", disposition=disposition.value, rule=match.rule.name if match else None)
-        return Receipt(disposition, *uids)
+        return self._taken(Header(*named, is_foreign=match is None), sender, match)
 
     def take_up(self) -> None:
         """Make jobs of what a killed service had written down and not enqueued; its sender was not told anything."""
@@ -76,24 +78,69 @@ class Inbox:
         """Objects in quarantine."""
         return len({key.split("/")[2] for key in self.blobs.list(f"{QUARANTINE}/")})
 
+    def _taken(self, header: Header, sender: str, match: Match | None) -> Receipt:
+        disposition = Disposition.LEFT_ALONE if match is None else Disposition.ACCEPTED
+        note = "" if match else "No rule takes it; it was left alone."
+        uids = (header.sop_class, header.sop_instance)
+        self.audit.write(AuditEntry(AuditEvent.RECEIVED, sender, self.title, header.study, [uids], note=note))
+        self.log.info("object received", disposition=disposition.value, rule=match.rule.name if match else None)
+        return Receipt(disposition, *uids)
+
+    def _misplaced(self, header: Header, sender: str) -> Receipt:
+        uids, note = (header.sop_class, header.sop_instance), "It is not of the study that was named; it was not kept."
+        failure = Outcome.MINOR_FAILURE
+        self.audit.write(AuditEntry(AuditEvent.RECEIVED, sender, self.title, header.study, [uids], failure, note))
+        self.log.warning("object received", disposition=Disposition.MISPLACED.value)
+        return Receipt(Disposition.MISPLACED, *uids)
+
     def _accept(self, data: bytes, digest: str, match: Match) -> None:
-        """On disk first, then the job; what is in a job already, running or done, is left to it."""
-        identifier = self.jobs.new_id(DRAWING_JOB, digest)
-        if self._is_in_a_job(identifier):
-            return
+        """On disk first, then the job; what a job is at work on, or has given back the results of, is left to it."""
+        drawing = self.jobs.new_id(DRAWING_JOB, digest)
+        fruitless: list[str] = []
+        for identifier in self._identifiers(digest):
+            status = self._status(identifier)
+            if status is None:
+                break
+            if not self._is_fruitless(status, drawing):
+                return
+            fruitless.append(identifier)
         labels = None if match.labels is None else sorted(match.labels)
         rule = match.rule
         argument = {"object": identifier, "rule": rule.name, "labels": labels, "send_to": list(rule.send_to)}
+        argument["drawing"] = drawing
         self.blobs.put(f"{INBOX}/{identifier}/{OBJECT}", data)
         self.blobs.put(f"{INBOX}/{identifier}/{ARGUMENT}", json.dumps(argument).encode())
         self.jobs.enqueue(DRAWING_JOB, argument, identifier)
+        self._release(drawing, fruitless)
+
+    def _identifiers(self, digest: str) -> Iterator[str]:
+        """Of the first job of a drawing, and of those that follow one without results."""
+        yield self.jobs.new_id(DRAWING_JOB, digest)
+        for number in count(2):
+            yield self.jobs.new_id(DRAWING_JOB, f"{digest}\n{number}")
+
+    def _is_fruitless(self, status: JobStatus, drawing: str) -> bool:
+        """Whether a job has ended, or is about to, without giving anything back."""
+        if status.state.is_final:
+            return not (status.result or {}).get("stored")
+        is_aside = self.blobs.exists(f"{QUARANTINE}/{drawing}/{OBJECT}")
+        return is_aside and not self.blobs.exists(f"{INBOX}/{status.id}/{OBJECT}")
+
+    def _release(self, drawing: str, fruitless: Sequence[str]) -> None:
+        """A drawing that was sent again is in quarantine no more, nor in the backlog on account of jobs that failed."""
+        for identifier in fruitless:
+            self.blobs.delete(f"{INBOX}/{identifier}/")
+        if self.blobs.exists(f"{QUARANTINE}/{drawing}/{OBJECT}"):
+            self.blobs.delete(f"{QUARANTINE}/{drawing}/")
 
     def _is_in_a_job(self, identifier: str) -> bool:
+        return self._status(identifier) is not None
+
+    def _status(self, identifier: str) -> JobStatus | None:
         try:
-            self.jobs.status(identifier)
+            return self.jobs.status(identifier)
         except UnknownJob:
-            return False
-        return True
+            return None
 
     def _quarantine(self, data: bytes, digest: str, sender: str, error: InputError) -> Receipt:
         quarantine(self.blobs, digest, data, str(error))

@@ -10,6 +10,7 @@ from pydicom.uid import (
     SegmentationStorage,
     SurfaceSegmentationStorage,
 )
+from pynetdicom import ALL_TRANSFER_SYNTAXES, AllStoragePresentationContexts
 
 from service.adapters.dicom.masks import DRAWINGS
 
@@ -28,6 +29,13 @@ SENT = (
 )
 #: Images that drawings refer to; what a retrieval can bring.
 IMAGES = tuple(UID(f"1.2.840.10008.5.1.4.1.1.{tail}") for tail in ("4", "4.1", "4.4", "2", "2.1", "128", "130", "7"))
+#: Every other storage class: acknowledged and left alone, so that an archive may forward whatever comes.
+LEFT_ALONE = tuple(
+    UID(uid)
+    for uid in sorted({*(str(context.abstract_syntax) for context in AllStoragePresentationContexts), *SENT})
+    if uid not in RECEIVED
+)
+LEFT_ALONE_SYNTAXES = tuple(UID(uid) for uid in ALL_TRANSFER_SYNTAXES)
 #: Accepted for drawings, and proposed for everything else.
 ACCEPTED_SYNTAXES = (ExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossless)
 PROPOSED_SYNTAXES = (ExplicitVRLittleEndian, ImplicitVRLittleEndian)
