@@ -117,6 +117,8 @@ def calibrate_bundle(
 ) -> Calibration:
     """Calibrate a bundle on a cohort's validation cases and record the result in its manifest.
 
+    Figures that were measured before are of another model and are taken out (`Manifest.accuracy`).
+
     Raises:
         BundleError: the bundle cannot be trusted.
         InvalidParameter: the model was trained on one of the cases.
@@ -133,8 +135,13 @@ def calibrate_bundle(
         "cross_entropy_by_spread": found.cross_entropies(),
     }
     discrepancy = {"spread_mm": found.best.spread_mm, "fidelity": found.best.fidelity}
+    # What was measured before does not hold any more.
     changed = replace(
-        model.manifest, likelihood_precision=found.best.precision, discrepancy=discrepancy, calibration=facts
+        model.manifest,
+        likelihood_precision=found.best.precision,
+        discrepancy=discrepancy,
+        calibration=facts,
+        accuracy={},
     )
     if model.completer is not None:
         changed = with_share(replace(model, manifest=changed), cohort.validation, watch)
@@ -193,7 +200,7 @@ def calibrate_bundle_as(folder: Path, known: Manifest, cohort: Cohort, *, thread
     """Let a bundle trust drawings as much as another calibrated one does; how its own answers look is found out anew.
 
     For models of one training that differ in their prior: which precision and fidelity come out best is often chance,
-    and would stand for a difference between the priors.
+    and would stand for a difference between the priors. Figures that were measured before are taken out.
 
     Args:
         known: of the other bundle.
@@ -207,6 +214,7 @@ def calibrate_bundle_as(folder: Path, known: Manifest, cohort: Cohort, *, thread
         likelihood_precision=known.likelihood_precision,
         discrepancy=known.discrepancy,
         calibration=known.calibration,
+        accuracy={},
     )
     write_manifest(with_sound_drawings(replace(model, manifest=changed), cohort.validation), folder)
 

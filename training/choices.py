@@ -79,6 +79,9 @@ def configured(
     Flow and ARD are trained along with the decoder unless the objective is ``variational``, when None: codes that are
     Gaussians get both when training is over (`training.pruning`). ``paper`` is the MorphoFlow paper as written: points
     as codes, soft Dice, a plain decoder, the flow on the codes themselves, batches of 6.
+
+    Raises:
+        InvalidParameter: a weight of ARD was given where ARD does not act, or the device is not there.
     """
     from model.networks.decoder import DecoderShape
     from model.networks.flow import FlowShape
@@ -98,6 +101,11 @@ def configured(
         if paper
         else replace(plain.objective, name=objective.value)
     )
+    if ard_weight is not None and not prior.use_ard:
+        raise InvalidParameter(
+            "ARD does not act along, so that --ard-weight would do nothing; it is accepted with --ard.",
+            part="ard_weight",
+        )
     if ard_weight is not None:
         loss = replace(loss, lambda_ard=ard_weight)
     return replace(

@@ -22,16 +22,13 @@ from training.choices import (
     RegimeName,
     SplitName,
     anatomy_code,
-    configured,
     resolved,
-    with_batches,
-    with_duration,
-    with_patience,
 )
-from training.cohort_options import takes_cohort
+from training.cohort_options import opened_cohort, takes_cohort
 from training.cohorts import Cohort, CohortOptions
-from training.cohorts.sources import CohortSource, open_cohort
+from training.cohorts.sources import CohortSource
 from training.console import check_output, exit_status, finding_counts, progress, tell_findings, warn
+from training.outputs import ForceOption, check_new_files
 from training.reporting.command import report
 from training.sweep.command import sweep
 
@@ -95,30 +92,33 @@ def train(
 ) -> None:
     """Train a shape model on a cohort of masks or of meshes."""
     with exit_status(goes_on="--resume goes on"):
+        from training.configuring import check_patience, configured_for
         from training.runs import check_free
 
         if output is not None:
             check_output(output, is_folder=True)
         if output is not None and not resume:
             check_free(output)
-        found = open_cohort(source, options)
+        found = opened_cohort(source, options)
         tell_findings(found)
+        check_patience(found, patience)
         warn(expectations.of_training(found))
-        known = source.cohort is not None and found.reflects and objective is not ObjectiveName.PAPER
-        paired = known if reflect is None else reflect
-        config = configured(
+        config = configured_for(
+            found,
             objective,
             regime,
             latent_size,
+            known=source.cohort is not None,
+            reflect=reflect,
             flow=flow,
             ard=ard,
-            reflected=paired,
+            ard_weight=ard_weight,
+            steps=steps,
+            epochs=epochs,
+            patience=patience,
             seed=options.seed,
             device=device,
-            ard_weight=ard_weight,
         )
-        codes = (2 if paired else 1) * len(found.train)
-        config = with_patience(with_duration(with_batches(config, codes), steps, epochs, codes), patience)
         folder = output or Path("runs") / f"{found.name}-{regime}"
         if not resume:
             check_free(folder)
@@ -143,17 +143,22 @@ def export(
         ),
     ] = None,
     least_movement: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="With pruning: what moves less than this share of the most goes.")
-    ] = LEAST_MOVEMENT,
-    training_share: Annotated[
-        float,
+        float | None,
         typer.Option(
             min=0.0,
             max=1.0,
-            help="With pruning: the least that stays of the prior of the training; more where validation shapes of a "
-            "cohort that is named want it.",
+            help=f"With pruning: what moves less than this share of the most goes; {LEAST_MOVEMENT:g} when left out.",
         ),
-    ] = LEAST_OF_TRAINING,
+    ] = None,
+    training_share: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="With pruning: the least that stays of the prior of the training, "
+            f"{LEAST_OF_TRAINING:g} when left out; more where validation shapes of a cohort that is named want it.",
+        ),
+    ] = None,
     resolution_mm: Annotated[
         float, typer.Option(min=0.25, max=10.0, help="Grid step of surfaces (mm) unless a request names another.")
     ] = 1.0,
@@ -172,7 +177,16 @@ def export(
         check_output(output, is_folder=True)
         stood_still = wants_prior(run)
         fitted = stood_still if prune is None else prune
-        parts = PriorParts(least_movement=least_movement, least_of_training=training_share)
+        if not fitted and (least_movement is not None or training_share is not None):
+            raise InvalidParameter(
+                "Nothing is pruned, so that --least-movement and --training-share would do nothing; they are accepted "
+                "with --prune.",
+                part="prune",
+            )
+        parts = PriorParts(
+            least_movement=LEAST_MOVEMENT if least_movement is None else least_movement,
+            least_of_training=LEAST_OF_TRAINING if training_share is None else training_share,
+        )
         if source.is_given:
             if not (fitted and stood_still):
                 raise InvalidParameter(
@@ -205,7 +219,7 @@ def export(
 def _parts_for(run: Path, parts: "PriorParts", source: CohortSource, options: CohortOptions) -> "PriorParts":
     from training.prior_choice import MODELS, chosen_parts
 
-    found = open_cohort(source, options)
+    found = opened_cohort(source, options)
     if not found.validation:
         raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
     with progress(MODELS, f"choosing the prior on {found.name}") as bar:
@@ -249,7 +263,7 @@ def complete(
         given_bundle(bundle)
         if run is not None:
             check_output(run, is_folder=True)
-        found = open_cohort(source, options)
+        found = opened_cohort(source, options)
         tell_findings(found)
         warn(expectations.of_completion(found))
         folder = run or Path("runs") / f"{found.name}-completion"
@@ -283,7 +297,7 @@ def calibrate(
         from training.evaluate import given_bundle
 
         before = given_bundle(bundle)
-        found = open_cohort(source, options)
+        found = opened_cohort(source, options)
         if not found.validation:
             raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
         warn(expectations.of_calibration(found))
@@ -319,6 +333,7 @@ def evaluate(
     limit: Annotated[int | None, typer.Option(min=1, help="Measure only so many cases.")] = None,
     output: Annotated[Path | None, typer.Option(help="CSV file with every case.")] = None,
     record: Annotated[bool, typer.Option("--record", help="Write the figures into the bundle's manifest.")] = False,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure a model on held-out masks, beside interpolation without a model."""
@@ -329,9 +344,15 @@ def evaluate(
         from training.seen import check_unseen
 
         if output is not None:
-            check_output(output, is_folder=False)
+            check_new_files(output, force=force)
+        if record and (limit is not None or offset is not None):
+            raise InvalidParameter(
+                "A manifest holds figures of all cases with slices that are centred on the object; --record is "
+                "accepted without --limit and --offset.",
+                part="record",
+            )
         opened = open_named(model)
-        found = open_cohort(source, options)
+        found = opened_cohort(source, options)
         cases = found.of_split(split.value)[:limit]
         if not cases:
             raise InvalidParameter(f"The cohort has no {split} cases; {OTHER_SPLIT[split]}.", part="split")

@@ -1,28 +1,43 @@
 """The options that say which cohort a command is about, the same for every command."""
 
 import inspect
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from training.cohorts import CohortName, CohortOptions
-from training.cohorts.sources import CohortSource, LayoutName
+from training.cohorts import Cohort, CohortName, CohortOptions
+from training.cohorts.cohort import SideName
+from training.cohorts.sources import CohortSource, LayoutName, check_given, open_cohort
 from training.cohorts.voxelising import SpaceName
+from training.console import exit_status, progress
+
+#: Names the data folder where no option does.
+DATA_VARIABLE = "MORPHOFLOW_DATA"
 
 CohortOption = Annotated[CohortName | None, typer.Option("--cohort", help="A public cohort below the data folder.")]
 MasksOption = Annotated[Path | None, typer.Option("--masks", help="A folder of NIfTI, NRRD or MetaImage masks.")]
 MeshesOption = Annotated[
     Path | None, typer.Option("--meshes", help="A folder of closed meshes: STL, PLY, OBJ, VTK, VTP.")
 ]
-LayoutOption = Annotated[LayoutName, typer.Option("--layout", help="How the masks lie in --masks.")]
+LayoutOption = Annotated[
+    LayoutName | None, typer.Option("--layout", help="How the masks lie in --masks; folder when left out.")
+]
 LabelOption = Annotated[list[int] | None, typer.Option("--label", help="Label of the object in --masks; may repeat.")]
 DataOption = Annotated[
-    Path | None, typer.Option("--data", envvar="MORPHOFLOW_DATA", help="Folder that holds the public cohorts.")
+    Path | None, typer.Option("--data", envvar=DATA_VARIABLE, help="Folder that holds the public cohorts.")
 ]
-SpacingOption = Annotated[float, typer.Option("--spacing-mm", help="Voxel size of meshes and of MedMNIST files.")]
-SpaceOption = Annotated[SpaceName, typer.Option("--mesh-space", help="World of the coordinates in --meshes.")]
+SpacingOption = Annotated[
+    float | None, typer.Option("--spacing-mm", help="Voxel size of meshes and of MedMNIST files; 1 when left out.")
+]
+SpaceOption = Annotated[
+    SpaceName | None, typer.Option("--mesh-space", help="World of the coordinates in --meshes; RAS when left out.")
+]
+SideOption = Annotated[
+    SideName | None, typer.Option("--side", help="Side of the shapes in --masks or --meshes; not stated when left out.")
+]
 AlignOption = Annotated[bool, typer.Option("--align", help="Turn every shape to the mean of all.")]
 TestOption = Annotated[
     float, typer.Option("--test-fraction", min=0.0, max=0.9, help="Share of persons held out where no test split is.")
@@ -46,7 +61,8 @@ def takes_cohort(command: Command) -> Command:
         bound = signature.bind(*args, **values)
         bound.apply_defaults()
         given = bound.arguments
-        source, options = _chosen(**{name: given.pop(name) for name in asked})
+        with exit_status():
+            source, options = _chosen(**{name: given.pop(name) for name in asked})
         command(source=source, options=options, **given)
 
     call.__signature__ = signature  # type: ignore[attr-defined]
@@ -55,22 +71,49 @@ def takes_cohort(command: Command) -> Command:
     return call
 
 
+def opened_cohort(source: CohortSource, options: CohortOptions) -> Cohort:
+    """`open_cohort` with a bar while shapes are aligned.
+
+    Raises:
+        InvalidParameter, CohortError: see there.
+    """
+    if not source.align:
+        return open_cohort(source, options)
+    with progress(1, "aligning shapes") as bar:
+        return open_cohort(
+            source, options, lambda done, total: bar.update(bar.task_ids[0], completed=done, total=total)
+        )
+
+
 def _chosen(
     cohort: CohortOption = None,
     masks: MasksOption = None,
     meshes: MeshesOption = None,
-    layout: LayoutOption = LayoutName.FOLDER,
+    layout: LayoutOption = None,
     label: LabelOption = None,
     data: DataOption = None,
-    spacing_mm: SpacingOption = 1.0,
-    mesh_space: SpaceOption = SpaceName.RAS,
+    spacing_mm: SpacingOption = None,
+    mesh_space: SpaceOption = None,
+    side: SideOption = None,
     align: AlignOption = False,
     test_fraction: TestOption = 0.0,
     seed: SeedOption = 0,
     skip_refused: SkipOption = False,
     shippable: ShippableOption = False,
 ) -> tuple[CohortSource, CohortOptions]:
-    labels = tuple(label or ())
-    source = CohortSource(cohort, masks, meshes, layout, labels, data, spacing_mm, mesh_space, align)
+    if cohort is None and data is not None and str(data) == os.environ.get(DATA_VARIABLE):
+        data = None  # it holds for every command, also for those about other shapes
+    labels = tuple(label) if label else None
+    named = {
+        "layout": layout,
+        "labels": labels,
+        "data": data,
+        "spacing_mm": spacing_mm,
+        "space": mesh_space,
+        "side": side,
+    }
+    given: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
+    source = CohortSource(cohort, masks, meshes, align=align, **given)
+    check_given(source, given)
     options = CohortOptions(seed=seed, test_fraction=test_fraction, skip_refused=skip_refused, shippable_only=shippable)
     return source, options

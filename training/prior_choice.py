@@ -17,13 +17,13 @@ from jaxtyping import Float
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
 from training.calibration import PRECISIONS, with_precision
-from training.cohorts.cohort import Case
+from training.cohorts.cohort import Case, listed
 from training.config import Regime
 from training.evaluate import surface_distance
 from training.pruning import PriorParts
 from training.release import trial_model
 from training.runs import mask_digest, read_record
-from training.seen import listed, short_digest
+from training.seen import is_among
 
 #: Drawings of validation shapes that are reconstructed.
 REGIMES: tuple[Regime, ...] = ("thin", "orthogonal")
@@ -92,7 +92,7 @@ def chosen_parts(
 def _check_unseen(run: Path, cases: Sequence[Case]) -> None:
     values = read_record(run)[1]
     seen = {*values["train"].values(), *values.get("voxel_digests", ())}
-    names = [case.name for case in cases if not seen.isdisjoint((mask_digest(case), short_digest(case)))]
+    names = [case.name for case in cases if mask_digest(case) in seen or is_among(case, seen)]
     if names:
         raise InvalidParameter(
             f"The run was trained on {listed(names)}, which is to be among the validation cases; the cohort, --seed "

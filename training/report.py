@@ -14,6 +14,7 @@ from model.bundle import read_manifest, write_manifest
 from training.evaluate import Measurement, Method
 from training.sparsify import Regime
 
+#: Of a reconstruction, by the names of `training.metrics_masks.MaskAgreement`.
 FIGURES = ("dice", "asd_mm", "hd95_mm", "hd_mm")
 
 
@@ -44,6 +45,13 @@ class Row:
     asd_ratio: float
     hd95_ratio: float
     dice_gain: float
+
+
+def spread(values: Sequence[float]) -> tuple[float, float]:
+    """Mean and population standard deviation; not numbers where there are no values, or no finite ones."""
+    if not values or not np.isfinite(values).all():
+        return float(np.mean(values)) if values else math.nan, math.nan
+    return float(np.mean(values)), float(np.std(values))
 
 
 def summarise(measurements: Sequence[Measurement]) -> list[Row]:
@@ -110,8 +118,8 @@ def _row(measurements: Sequence[Measurement], regime: Regime, method: Method) ->
     taken = [found for found in mine.values() if found.agreement is not None]
     shared = [name for name, found in mine.items() if found.agreement and name in models and models[name].agreement]
     theirs, ours = ([_values(source[name]) for name in shared] for source in (mine, models))
-    figures = {name: _spread([_values(found)[name] for found in taken]) for name in FIGURES}
-    figures["seconds"] = _spread([found.seconds for found in taken])
+    figures = {name: Spread(*spread([_values(found)[name] for found in taken])) for name in FIGURES}
+    figures["seconds"] = Spread(*spread([found.seconds for found in taken]))
     return Row(
         regime,
         method,
@@ -126,12 +134,6 @@ def _row(measurements: Sequence[Measurement], regime: Regime, method: Method) ->
 
 def _values(found: Measurement) -> dict[str, float]:
     return asdict(found.agreement) if found.agreement else dict.fromkeys(FIGURES, math.nan)
-
-
-def _spread(values: Sequence[float]) -> Spread:
-    if not values or not np.isfinite(values).all():
-        return Spread(float(np.mean(values)) if values else math.nan, math.nan)
-    return Spread(float(np.mean(values)), float(np.std(values)))
 
 
 def _mean(values: Sequence[dict[str, float]], name: str) -> float:
@@ -158,8 +160,8 @@ def _cells(row: Row) -> list[str]:
     ]
 
 
-def _pair(spread: Spread) -> str:
-    return f"{spread.mean:.3f} ± {spread.sd:.3f}"
+def _pair(values: Spread) -> str:
+    return f"{values.mean:.3f} ± {values.sd:.3f}"
 
 
 def _finite(value: object) -> object:

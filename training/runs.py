@@ -105,7 +105,7 @@ def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
     return {
         "config": config.as_dict(),
         "cohort": cohort.name,
-        "side": cohort.side,
+        "side": cohort.recorded_side,
         "source": cohort.source,
         "licence": cohort.licence,
         "attribution": cohort.attribution,
@@ -176,7 +176,8 @@ def _check_same(folder: Path, wanted: dict[str, Any]) -> None:
 
 def _difference(values: dict[str, Any], config: TrainingConfig, wanted: dict[str, Any]) -> str:
     """In what a record that was read differs from the one that is wanted; fields not there yet have their defaults."""
-    known = {"voxel_digests": wanted["voxel_digests"], **values, "config": json.loads(json.dumps(config.as_dict()))}
+    # Digests of voxels may be of an earlier kind; masks are told by those of ``train``.
+    known = {**values, "voxel_digests": wanted["voxel_digests"], "config": json.loads(json.dumps(config.as_dict()))}
     return first_difference(known, json.loads(json.dumps(wanted)))
 
 

@@ -1,21 +1,33 @@
-"""Which shapes a model was trained on: told by digests of their voxels, which stand in its manifest."""
+"""Which shapes a model was trained on: told by digests of their voxels, which stand in its manifest.
 
-from collections.abc import Sequence
+Digests are of the shape in the world as it was stored, before any alignment (`shape_digest`). Manifests and runs from
+before that hold digests of the bare array (`voxel_digest`), which are looked for as well.
+"""
+
+from collections.abc import Collection, Sequence
 
 from model.bundle import Manifest
 from model.errors import InvalidParameter
-from training.cohorts.cohort import Case
-from training.cohorts.inspect import voxel_digest, without_specks
+from training.cohorts.cohort import Case, listed
+from training.cohorts.inspect import nearest_ras, shape_digest, voxel_digest, without_specks
 
 #: Hexadecimal digits of a digest that a manifest holds.
 DIGITS = 16
-#: Cases that a sentence names.
-NAMED = 3
 
 
 def short_digest(case: Case) -> str:
-    """First `DIGITS` digits of `voxel_digest`: the same wherever a mask lies, so also after alignment."""
-    return voxel_digest(case.mask)[:DIGITS]
+    """First `DIGITS` digits of `shape_digest`: the same wherever a mask lies, so also after alignment."""
+    return shape_digest(case.mask, case.stored or case.grid)[:DIGITS]
+
+
+def is_among(case: Case, digests: Collection[str]) -> bool:
+    """Whether a case is one of those with these digests: with its specks, or without as masks are trained on."""
+    grid = case.stored or case.grid
+    return any(
+        digest[:DIGITS] in digests
+        for mask in (case.mask, without_specks(case.mask))
+        for digest in (shape_digest(mask, grid), voxel_digest(mask), voxel_digest(nearest_ras(mask, grid)[0]))
+    )
 
 
 def check_unseen(manifest: Manifest, cases: Sequence[Case], measured: str = "validation") -> None:
@@ -28,7 +40,7 @@ def check_unseen(manifest: Manifest, cases: Sequence[Case], measured: str = "val
         InvalidParameter: the model was trained on one of the cases.
     """
     known = set(manifest.training_masks)
-    seen = [case.name for case in cases if known and _is_among(case, known)]
+    seen = [case.name for case in cases if known and is_among(case, known)]
     if seen:
         raise InvalidParameter(
             f"The model was trained on {listed(seen)}, which is to be among the {measured} cases; --seed and "
@@ -44,21 +56,10 @@ def check_seen(manifest: Manifest, cases: Sequence[Case]) -> None:
         InvalidParameter: the model was not trained on one of the cases.
     """
     known = set(manifest.training_masks)
-    other = [case.name for case in cases if known and not _is_among(case, known)]
+    other = [case.name for case in cases if known and not is_among(case, known)]
     if other:
         raise InvalidParameter(
             f"The model was not trained on {listed(other)}, which the network would learn from; shapes, --seed and "
             "--test-fraction of the training are accepted.",
             part="cohort",
         )
-
-
-def listed(names: Sequence[str]) -> str:
-    """The first names, and how many more there are."""
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _is_among(case: Case, digests: set[str]) -> bool:
-    """With its specks, or without as masks are trained on."""
-    return short_digest(case) in digests or voxel_digest(without_specks(case.mask))[:DIGITS] in digests

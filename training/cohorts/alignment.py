@@ -8,6 +8,7 @@ whole stays where it was.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,8 @@ SAMPLED = 0.2
 #: Principal axes are followed only where they explain the mean so much better than the shape as it lies.
 LIKELIER = 0.7
 
-Watch = Callable[[str], None]
+#: Called after each registration: how many are done, of how many.
+Watch = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -50,17 +52,23 @@ class Placed:
     centroid: Float[np.ndarray, "3"]
 
 
-def align(cohort: Cohort, watch: Watch = lambda name: None) -> Cohort:
+def align(cohort: Cohort, watch: Watch = lambda done, total: None) -> Cohort:
     """The cohort with each grid turned and moved; validation and test shapes go to the mean of the training shapes."""
+    done = count(1)
+    total = ROUNDS * len(cohort.train) + len(cohort.validation) + len(cohort.test)
+
+    def advance() -> None:
+        watch(next(done), total)
+
     placed = {case.name: _placed(case) for case in cohort.cases}
     common = _common_grid([placed[case.name] for case in cohort.train])
-    turns = _groupwise([placed[case.name] for case in cohort.train], common, watch)
+    turns = _groupwise([placed[case.name] for case in cohort.train], common, advance)
     mean = _mean([placed[case.name] for case in cohort.train], turns, common)
     found = dict(zip((case.name for case in cohort.train), turns, strict=True))
     for case in (*cohort.validation, *cohort.test):
         shape = placed[case.name]
         found[case.name] = registered(shape, mean, common, likely_start(shape, mean, common))
-        watch(case.name)
+        advance()
 
     def turned(cases: Sequence[Case]) -> tuple[Case, ...]:
         return tuple(_turned(case, found[case.name], placed[case.name].centroid) for case in cases)
@@ -121,17 +129,18 @@ def _axes(inside: Bool[np.ndarray, "i j k"], grid: Grid) -> Float[np.ndarray, "3
     return np.asarray(axes)
 
 
-def _groupwise(shapes: Sequence[Placed], common: Grid, watch: Watch) -> list[Float[np.ndarray, "4 4"]]:
+def _groupwise(shapes: Sequence[Placed], common: Grid, advance: Callable[[], None]) -> list[Float[np.ndarray, "4 4"]]:
     volumes = [float((shape.field > 0).sum() * np.prod(shape.grid.spacing)) for shape in shapes]
     middle = int(np.argsort(volumes)[len(volumes) // 2])
     mean = _sampled(shapes[middle], np.eye(4), common)
     turns = [likely_start(shape, mean, common) for shape in shapes]
     for _ in range(ROUNDS):
-        turns = [registered(shape, mean, common, turn) for shape, turn in zip(shapes, turns, strict=True)]
+        for number, shape in enumerate(shapes):
+            turns[number] = registered(shape, mean, common, turns[number])
+            advance()
         back = np.linalg.inv(_mean_transform(turns))
         turns = [back @ turn for turn in turns]
         mean = _mean(shapes, turns, common)
-        watch("round")
     return turns
 
 
@@ -184,7 +193,8 @@ def _common_grid(shapes: Sequence[Placed]) -> Grid:
 def _turned(case: Case, turn: Float[np.ndarray, "4 4"], centroid: Float[np.ndarray, "3"]) -> Case:
     to_centroid, back = np.eye(4), np.eye(4)
     to_centroid[:3, 3], back[:3, 3] = -centroid, centroid
-    return replace(case, grid=Grid(case.grid.shape, back @ turn @ to_centroid @ case.grid.affine))
+    turned = Grid(case.grid.shape, back @ turn @ to_centroid @ case.grid.affine)
+    return replace(case, grid=turned, stored=case.stored or case.grid)
 
 
 def _image(values: Float[np.ndarray, "i j k"], grid: Grid) -> Any:

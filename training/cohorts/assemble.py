@@ -4,7 +4,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from model.errors import CohortError
-from training.cohorts.cohort import Case, Cohort, Provenance, Refusal, divided_persons, hold_out, refusal_error
+from training.cohorts.cohort import (
+    NOT_STATED,
+    Case,
+    Cohort,
+    Provenance,
+    Refusal,
+    divided_persons,
+    hold_out,
+    listed,
+    nothing_left_error,
+    refusal_error,
+)
 from training.cohorts.inspect import copies, findings_of, outliers, without_specks
 
 
@@ -34,7 +45,7 @@ def assemble(
     provenance: Provenance,
     options: CohortOptions,
     *,
-    side: str = "mixed",
+    side: str = NOT_STATED,
 ) -> Cohort:
     """Inspect, refuse, clean and split.
 
@@ -50,7 +61,7 @@ def assemble(
     left_out = {refusal.name for refusal in found}
     kept = [_inspected(case) for case in filled if case.name not in left_out]
     if not any(case.split == "train" for case in kept):
-        raise refusal_error(found, nothing_left=True)
+        raise nothing_left_error(kept, found)
     stopping = [refusal for refusal in found if refusal.stops]
     if stopping and not options.skip_refused:
         raise refusal_error(stopping)
@@ -79,7 +90,8 @@ def _split(cohort: Cohort, options: CohortOptions) -> Cohort:
     divided = divided_persons(cases)
     if divided:
         raise CohortError(
-            f"{len(divided)} person(s) stand in more than one split; each person is accepted in one split only."
+            f"{len(divided)} person(s) stand in more than one split ({listed(divided)}); each person is accepted in "
+            "one split only."
         )
     train, validation, test = (
         tuple(case for case in cases if case.split == split) for split in ("train", "validation", "test")

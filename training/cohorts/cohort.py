@@ -1,7 +1,9 @@
 """A cohort: masks of one structure, split by person, with what was found on looking at them."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Literal
 
 import numpy as np
@@ -11,6 +13,19 @@ from model.errors import CohortError
 from model.geometry import Grid
 
 Split = Literal["train", "validation", "test"]
+#: Side of masks of which nobody has said any.
+NOT_STATED = "not stated"
+#: Names that a sentence holds.
+NAMED = 3
+
+
+class SideName(StrEnum):
+    """Side convention of a cohort's masks."""
+
+    LEFT = "left"
+    RIGHT = "right"
+    MIXED = "mixed"
+    UNPAIRED = "unpaired"
 
 
 @dataclass(frozen=True)
@@ -24,6 +39,7 @@ class Case:
         mask: (i, j, k) voxels of the object.
         grid: its voxels in the world (RAS mm).
         findings: peculiarities that were seen and let pass, as sentences.
+        stored: its voxels in the world before an alignment turned them; None where none did.
     """
 
     name: str
@@ -32,6 +48,7 @@ class Case:
     mask: Bool[np.ndarray, "i j k"]
     grid: Grid
     findings: tuple[str, ...] = ()
+    stored: Grid | None = None
 
 
 @dataclass(frozen=True)
@@ -68,7 +85,7 @@ class Cohort:
         train, validation, test: disjoint in persons.
         refused: what was left out.
         provenance: source, licence and attribution.
-        side: side convention of the masks: ``left``, ``right``, ``mixed`` or ``unpaired``.
+        side: side convention of the masks: ``left``, ``right``, ``mixed``, ``unpaired`` or ``not stated``.
     """
 
     name: str
@@ -77,7 +94,7 @@ class Cohort:
     test: tuple[Case, ...]
     refused: tuple[Refusal, ...]
     provenance: Provenance
-    side: str = "mixed"
+    side: str = NOT_STATED
 
     @property
     def cases(self) -> tuple[Case, ...]:
@@ -91,6 +108,11 @@ class Cohort:
         Where there are two, mirror images would be a second heap of shapes, with the mean between both.
         """
         return self.side == "unpaired"
+
+    @property
+    def recorded_side(self) -> str:
+        """Side as runs and manifests hold it: ``mixed`` where none is stated, since both may be among the shapes."""
+        return SideName.MIXED.value if self.side == NOT_STATED else self.side
 
     @property
     def licence(self) -> str:
@@ -136,9 +158,29 @@ def divided_persons(cases: Iterable[Case]) -> tuple[str, ...]:
     return tuple(sorted(person for person, found in splits.items() if len(found) > 1))
 
 
-def refusal_error(refused: Sequence[Refusal], *, nothing_left: bool = False) -> CohortError:
+def refusal_error(refused: Sequence[Refusal]) -> CohortError:
     """The error that lists each refused case and why."""
-    head = "No case is left to train on" if nothing_left else f"{len(refused)} case(s) must not be used"
-    reasons = "; ".join(f"{refusal.name}: {refusal.reason}" for refusal in refused)
-    tail = "" if nothing_left else "; --skip-refused goes on without them"
-    return CohortError(f"{head}: {reasons or 'the cohort holds no masks, NIfTI, NRRD or MetaImage is accepted'}{tail}")
+    return CohortError(
+        f"{len(refused)} case(s) must not be used: {_reasons(refused)}; --skip-refused goes on without them"
+    )
+
+
+def nothing_left_error(cases: Sequence[Case], refused: Sequence[Refusal]) -> CohortError:
+    """The error that no case is left to train on: which splits the others are in, and what was refused."""
+    if not (cases or refused):
+        return CohortError(
+            "No case is left to train on: the cohort holds no masks, NIfTI, NRRD or MetaImage is accepted"
+        )
+    counts = Counter(case.split for case in cases)
+    splits = f"{counts['train']} train, {counts['validation']} validation, {counts['test']} test"
+    return CohortError(f"No case is left to train on ({splits}){': ' if refused else ''}{_reasons(refused)}")
+
+
+def _reasons(refused: Sequence[Refusal]) -> str:
+    return "; ".join(f"{refusal.name}: {refusal.reason}" for refusal in refused)
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names, and how many more there are."""
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")

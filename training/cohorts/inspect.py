@@ -6,6 +6,7 @@ Kept with a finding: specks, several large parts, an object that the crop cuts o
 
 import hashlib
 from collections.abc import Sequence
+from itertools import permutations
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,6 +26,9 @@ OUTLIER_LIMIT = 8.0
 LEAST_SIZE_SPREAD = 0.1
 #: The same for log spacing: a factor of 2.
 LEAST_SPACING_SPREAD = float(np.log(2.0)) / OUTLIER_LIMIT
+#: Spacings are told apart by hundredths of a mm; where one ends and the next begins (a share of it) no usual spacing
+#: lies, so that rounding does not tell equal ones apart.
+SPACING_STEP_MM, SPACING_BORDER = 0.01, 0.382
 #: With fewer cases than this nothing can be called an outlier.
 LEAST_CASES = 3
 
@@ -106,7 +110,7 @@ def equal_neighbours(mask: Bool[np.ndarray, "i j k"], axis: int) -> float:
 
 
 def copies(cases: Sequence[Case]) -> tuple[Refusal, ...]:
-    """All but one of the cases whose objects have exactly the same voxels, wherever they lie in their crops.
+    """All but one of the cases whose objects have exactly the same voxels in the world, wherever they lie in it.
 
     The one that stays is of the test split if any is, then of validation, so that no measured shape is trained on.
     """
@@ -114,15 +118,39 @@ def copies(cases: Sequence[Case]) -> tuple[Refusal, ...]:
     kept: dict[str, str] = {}
     refused = []
     for case in sorted(cases, key=lambda case: order[case.split]):
-        key = voxel_digest(case.mask)
+        key = shape_digest(case.mask, case.grid)
         if key in kept:
             refused.append(Refusal(case.name, f"it is the same mask as {kept[key]}, which is kept", stops=False))
         kept.setdefault(key, case.name)
     return tuple(refused)
 
 
+def shape_digest(mask: Bool[np.ndarray, "i j k"], grid: Grid) -> str:
+    """SHA-256 over the object's voxels and their size, wherever it lies and in whatever order its axes are stored.
+
+    Axes are brought to run nearest to R, A and S, so that a mirror image has another digest. The mask must not be
+    empty.
+    """
+    turned, spacing = nearest_ras(mask, grid)
+    size = np.floor(spacing / SPACING_STEP_MM + SPACING_BORDER).astype(int).tolist()
+    return hashlib.sha256(f"{size} {voxel_digest(turned)}".encode()).hexdigest()
+
+
+def nearest_ras(
+    mask: Bool[np.ndarray, "i j k"], grid: Grid
+) -> tuple[Bool[np.ndarray, "a b c"], Float[np.ndarray, "3"]]:
+    """Voxels and their spacing (mm), axes permuted and reversed so that they run nearest to R, A and S."""
+    along = grid.directions
+    first, second, third = max(
+        permutations(range(3)), key=lambda axes: sum(abs(along[world, axis]) for world, axis in enumerate(axes))
+    )
+    axes = (first, second, third)
+    steps = tuple(slice(None, None, 1 if along[world, axis] > 0 else -1) for world, axis in enumerate(axes))
+    return mask.transpose(axes)[steps], grid.spacing[list(axes)]
+
+
 def voxel_digest(mask: Bool[np.ndarray, "i j k"]) -> str:
-    """SHA-256 over the object's voxels, wherever it lies; the mask must not be empty."""
+    """SHA-256 over the object's voxels as they are stored, of any size; the mask must not be empty."""
     cropped = mask[bounding_box(mask)]
     return hashlib.sha256(repr(cropped.shape).encode() + np.packbits(cropped).tobytes()).hexdigest()
 

@@ -1,8 +1,9 @@
 """A folder of watertight meshes: STL, PLY, OBJ, legacy VTK and VTP, made masks of by VTK's stencil.
 
-A voxel belongs to the object when its centre lies inside the surface. Splits and persons come from ``cases.csv`` and
-from folders named train, validation and test, as for masks. Coordinates are mm; files of LPS programs are turned to
-RAS.
+A voxel belongs to the object when its centre lies inside the surface. Centres lie symmetrically about the mesh, so that
+a mask does not depend on where its mesh lies, and just off the faces that a mesh made of voxels has. Splits and persons
+come from ``cases.csv`` and from folders named train, validation and test, as for masks. Coordinates are mm; files of
+LPS programs are turned to RAS.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import VTK_UNSIGNED_CHAR, vtkObject
 from vtkmodules.vtkCommonDataModel import vtkImageData
@@ -25,8 +26,8 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 from model.errors import CohortError, InvalidMask, UnreadableImage
 from model.geometry import Grid
 from training.cohorts.assemble import CohortOptions, assemble
-from training.cohorts.cohort import Cohort, Provenance, Refusal
-from training.cohorts.folder import read_cases, read_table
+from training.cohorts.cohort import Cohort, Provenance
+from training.cohorts.folder import absent, read_cases, read_table
 from training.cohorts.reading import MaskFile, stem
 from training.cohorts.voxelising import SpaceName, Voxelising
 
@@ -43,6 +44,10 @@ ONE_MM = Voxelising()
 #: Room of background around a mesh (mm), and the most voxels that one may become.
 MARGIN_MM = 4.0
 MOST_VOXELS = 100_000_000
+#: Centres are so much off their symmetric places along each axis (steps), as no face of a mesh is.
+OFF_FACES = np.array([0.0061, 0.0083, 0.0047])
+#: A mesh of this share of a voxel more than a whole number of them is as wide as one more.
+WIDER = 0.51
 #: Extents that anatomy in mm has.
 EXTENT_RANGE_MM = (2.0, 2000.0)
 
@@ -59,9 +64,8 @@ def read_meshes(folder: Path, options: CohortOptions, *, how: Voxelising = ONE_M
     files = sorted(path for path in folder.rglob("*") if path.is_file() and is_mesh_file(path))
     if not files:
         raise CohortError(f"The folder holds no mesh; {', '.join(SUFFIXES)} are accepted.")
-    cases, refused = read_cases(files, rows, read=lambda path: read_mesh(path, how))
-    absent = rows.keys() - {stem(path) for path in files}
-    refused += [Refusal(case, "the table lists it but its file is missing") for case in sorted(absent)]
+    cases, refused = read_cases(files, folder, rows, read=lambda path: read_mesh(path, how))
+    refused += absent(rows, files)
     return assemble(folder.resolve().name, cases, refused, OWN_MESHES, options)
 
 
@@ -126,9 +130,7 @@ def voxelised(surface: Any, how: Voxelising, name: str) -> MaskFile:
         raise InvalidMask(
             f"the mesh is {extent:.3g} mm long; coordinates in mm, {low:g} to {high:g} long, are accepted", part=name
         )
-    # Half a step off round numbers, so that no centre lies on a face of a mesh that was made of voxels.
-    lower = np.floor((bounds[:, 0] - MARGIN_MM) / how.spacing_mm) * how.spacing_mm + 0.5 * how.spacing_mm
-    shape = np.ceil((bounds[:, 1] + MARGIN_MM - lower) / how.spacing_mm).astype(int) + 1
+    lower, shape = _lattice(bounds, how.spacing_mm)
     if shape.astype(float).prod() > MOST_VOXELS:
         raise InvalidMask(f"the mesh would have over {MOST_VOXELS} voxels; a larger spacing is accepted", part=name)
     mask = _stencil(surface, lower, shape, how.spacing_mm)
@@ -137,6 +139,17 @@ def voxelised(surface: Any, how: Voxelising, name: str) -> MaskFile:
     if how.space is SpaceName.LPS:
         affine = np.diag([-1.0, -1.0, 1.0, 1.0]) @ affine
     return MaskFile(mask, Grid((int(shape[0]), int(shape[1]), int(shape[2])), affine))
+
+
+def _lattice(bounds: Float[np.ndarray, "3 2"], step_mm: float) -> tuple[Float[np.ndarray, "3"], Int[np.ndarray, "3"]]:
+    """First centre (mm) and number of voxels along each axis, with room on both sides of a mesh of these bounds.
+
+    The outermost faces of the mesh lie a quarter of a step from the nearest centres at least, and half a step from
+    them where the mesh is a whole number of steps wide, as meshes made of voxels are.
+    """
+    across = np.ceil(np.ptp(bounds, axis=1) / step_mm - WIDER)
+    shape = (across + 2.0 * np.ceil(MARGIN_MM / step_mm)).astype(int)
+    return bounds.mean(axis=1) + (OFF_FACES - (shape - 1) / 2.0) * step_mm, shape
 
 
 @contextmanager

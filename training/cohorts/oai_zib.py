@@ -14,7 +14,7 @@ from pathlib import Path
 from model.errors import CohortError
 from training.cohorts.assemble import CohortOptions, assemble
 from training.cohorts.cohort import Cohort, Provenance
-from training.cohorts.folder import read_cases, read_table
+from training.cohorts.folder import merged, read_cases, read_table
 from training.cohorts.reading import is_mask_file, stem
 
 FEMUR = (1,)
@@ -38,8 +38,8 @@ def read_oai_zib(folder: Path, options: CohortOptions, *, labels: Collection[int
         raise CohortError(
             "The folder holds no mask that is named after a participant (seven digits); those of OAI-ZIB are accepted."
         )
-    rows = {stem(path): {"person": path.name[:7]} for path in files}
-    table = read_table(folder / "cases.csv")
-    rows = {name: {**row, **table.get(name, table.get(row["person"], {}))} for name, row in rows.items()}
-    cases, refused = read_cases(files, rows, labels or FEMUR)
+    known = {stem(path): {"person": path.name[:7]} for path in files}
+    table = read_table(folder / "cases.csv", persons=False)
+    rows = merged(known, {name: table.get(name, table.get(row["person"], {})) for name, row in known.items()})
+    cases, refused = read_cases(files, folder, rows, labels or FEMUR)
     return assemble("oai-zib", cases, refused, PROVENANCE, options, side="mixed")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from model.errors import CohortError
 from training.cohorts.assemble import CohortOptions, assemble
-from training.cohorts.cohort import Cohort, Provenance, Refusal
-from training.cohorts.folder import Row, read_cases, read_table
+from training.cohorts.cohort import Cohort, Provenance
+from training.cohorts.folder import Row, absent, read_cases, read_table
 from training.cohorts.reading import is_mask_file, stem
 
 
@@ -34,9 +34,8 @@ def read_published(
         for path in (folder / split).glob("*")
         if is_mask_file(path) and stem(path) in rows
     )
-    cases, refused = read_cases(files, rows)
-    absent = rows.keys() - {stem(path) for path in files}
-    refused += [Refusal(case, "the table lists it but its file is missing") for case in sorted(absent)]
+    cases, refused = read_cases(files, folder, rows)
+    refused += absent(rows, files)
     return assemble(folder.name, cases, refused, provenance, options, side=side)
 
 

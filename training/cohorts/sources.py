@@ -1,13 +1,14 @@
 """Where a cohort comes from: a public one by name, masks in one of several layouts, or meshes."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
 
 from model.errors import InvalidParameter
 from training.cohorts.assemble import CohortOptions
 from training.cohorts.catalogue import CohortName, data_folder, load_cohort
-from training.cohorts.cohort import Cohort
+from training.cohorts.cohort import Cohort, SideName
 from training.cohorts.decathlon import read_decathlon
 from training.cohorts.folder import read_folder
 from training.cohorts.medmnist import read_medmnist
@@ -38,6 +39,7 @@ class CohortSource:
         spacing_mm: voxel size where files state none: meshes and MedMNIST.
         space: of the coordinates of meshes.
         align: whether shapes are turned to their evolving mean.
+        side: of ``masks`` or ``meshes``; what their layout says, if anything, when None.
     """
 
     cohort: CohortName | None = None
@@ -49,6 +51,7 @@ class CohortSource:
     spacing_mm: float = 1.0
     space: SpaceName = SpaceName.RAS
     align: bool = False
+    side: SideName | None = None
 
     @property
     def is_given(self) -> bool:
@@ -56,7 +59,67 @@ class CohortSource:
         return any(one is not None for one in (self.cohort, self.masks, self.meshes))
 
 
-def open_cohort(source: CohortSource, options: CohortOptions) -> Cohort:
+#: Layouts whose files are label maps.
+LABELLED = (LayoutName.FOLDER, LayoutName.DECATHLON, LayoutName.VERSE, LayoutName.OAI_ZIB)
+#: Called while shapes are aligned: how many registrations are done, of how many.
+Watch = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Belonging:
+    """What an option goes with.
+
+    Attributes:
+        option: as it is written.
+        source: the same in words.
+        holds: whether a source is that.
+    """
+
+    option: str
+    source: str
+    holds: Callable[[CohortSource], bool]
+
+
+#: By the field of a source. Elsewhere the option would do nothing.
+BELONGINGS = {
+    "layout": Belonging("--layout", "--masks", lambda source: source.masks is not None),
+    "labels": Belonging(
+        "--label",
+        "--masks of the layouts folder, decathlon, verse and oai-zib",
+        lambda source: source.masks is not None and source.layout in LABELLED,
+    ),
+    "data": Belonging("--data", "--cohort", lambda source: source.cohort is not None),
+    "spacing_mm": Belonging(
+        "--spacing-mm",
+        "--meshes and with --layout medmnist",
+        lambda source: source.meshes is not None or (source.masks is not None and source.layout is LayoutName.MEDMNIST),
+    ),
+    "space": Belonging("--mesh-space", "--meshes", lambda source: source.meshes is not None),
+    "side": Belonging(
+        "--side", "--masks and --meshes", lambda source: source.masks is not None or source.meshes is not None
+    ),
+}
+
+
+def check_given(source: CohortSource, given: Collection[str]) -> None:
+    """Refuse options that would do nothing with a source.
+
+    Args:
+        given: fields of the source that a caller named, be it with what holds anyway.
+
+    Raises:
+        InvalidParameter: one of them does not go with the source.
+    """
+    for field, belonging in BELONGINGS.items():
+        if field in given and not belonging.holds(source):
+            option = belonging.option
+            raise InvalidParameter(
+                f"{option} would do nothing here; {option} goes with {belonging.source}.",
+                part=option.removeprefix("--").replace("-", "_"),
+            )
+
+
+def open_cohort(source: CohortSource, options: CohortOptions, watch: Watch = lambda done, total: None) -> Cohort:
     """Read, inspect, split and, when asked to, align.
 
     Raises:
@@ -69,14 +132,15 @@ def open_cohort(source: CohortSource, options: CohortOptions) -> Cohort:
         )
     if options.shippable_only and source.cohort is None:
         raise InvalidParameter("A folder of masks has no licence; --shippable goes with --cohort.", part="shippable")
-    if source.layout is not LayoutName.FOLDER and source.masks is None:
-        raise InvalidParameter("A layout is one of masks; --layout goes with --masks.", part="layout")
+    check_given(source, [one.name for one in fields(source) if getattr(source, one.name) != one.default])
     found = _read(source, options)
+    if source.side is not None:
+        found = replace(found, side=SideName(source.side).value)
     if not source.align:
         return found
     from training.cohorts.alignment import align
 
-    return align(found)
+    return align(found, watch)
 
 
 def _read(source: CohortSource, options: CohortOptions) -> Cohort:

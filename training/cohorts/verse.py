@@ -4,11 +4,12 @@
     <any>/derivatives/sub-verse004/sub-verse004_..._seg-subreg_ctd.json    one centroid a vertebra, voxels of the image
 
 Labels are 1 to 7 for C1 to C7, 8 to 19 for T1 to T12, 20 to 25 for L1 to L6 and 28 for T13. A person is a subject,
-however many of its scans there are; ``<any>`` with training, validation or test in its name says the split. A
+however many of its scans there are; ``<any>`` with the word training, validation or test in its name says the split. A
 vertebra at the border of its scan, or one with voxels and no centroid (annotated in part), is left out.
 """
 
 import json
+import re
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -66,9 +67,12 @@ def read_verse(folder: Path, options: CohortOptions, *, labels: Collection[int] 
 
 
 def split_of(scan: Path, root: Path) -> Split:
-    """Split of a scan by the name of a folder on the way to it, train when none tells."""
-    parts = [part.lower() for part in scan.relative_to(root.parent).parts[:-1]]
-    return next((split for part in reversed(parts) for word, split in SPLITS if word in part), "train")
+    """Split of a scan by a word in the name of a folder below the root, train when none tells.
+
+    Words are runs of letters, so that dataset-verse19test and 03test tell, and latest does not.
+    """
+    folders = [re.findall("[a-z]+", part.lower()) for part in scan.relative_to(root).parts[:-1]]
+    return next((split for words in reversed(folders) for word, split in SPLITS if word in words), "train")
 
 
 def _vertebrae(scan: Path, root: Path, wanted: Sequence[int]) -> Iterator[Case | Refusal]:

@@ -25,8 +25,8 @@ def completion_config(
     """The configuration for a cohort.
 
     Args:
-        reflect: whether every other sample is a mirror image; where the cohort says that it has both sides, or none,
-            when None.
+        reflect: whether every other sample is a mirror image; where the cohort says that it has both sides, or that
+            there are none, when None: not where no side is stated.
     """
     reflected = cohort.side in ("mixed", "unpaired") if reflect is None else reflect
     lattice = lattice_for(windows, MOST_VOXELS, LEAST_STEP_MM, MULTIPLE)

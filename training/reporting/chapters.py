@@ -29,7 +29,7 @@ def chapter_of(
 
     Args:
         folder: of the sweep, where the bundles of the cells lie.
-        cohort: its shapes, for the panels that show them; None where they cannot be read any more.
+        cohort: its shapes by `pictured_seed`, for the panels that show them; None where they cannot be read any more.
         pictures: whether panels may show shapes (A, D and E).
         watch: told which panel is drawn.
     """
@@ -43,10 +43,12 @@ def chapter_of(
 
 def _facts(results: Sequence[Result]) -> list[str]:
     first = results[0]
-    steps = ", ".join(map(str, sorted({one.steps for one in results})))
+    shapes, steps = (
+        ", ".join(map(str, sorted({getattr(one, name) for one in results}))) for name in ("shapes", "steps")
+    )
     objectives = ", ".join(sorted({one.objective for one in results}))
     words = [
-        f"{first.source}; licence: {first.licence}. {first.shapes} training shapes.",
+        f"{first.source}; licence: {first.licence}. {shapes} training shapes.",
         f"Optimiser steps of a cell: {steps}; objective: {objectives}.",
     ]
     bone = bone_of(first.cohort)
@@ -79,6 +81,22 @@ def _pictured(results: Sequence[Result]) -> list[Result]:
     return [one for one in results if one.latent_size == size]
 
 
+def pictured_seed(results: Sequence[Result]) -> int:
+    """The seed of the cells whose reconstructions are pictured, which says what their test shapes are.
+
+    The least one, of cells with flow and ARD where there are any.
+    """
+    shown = _pictured(results)
+    full = [one for one in shown if one.prior == PriorName.FLOW_ARD.value]
+    return min(one.seed for one in full or shown)
+
+
+def _reconstructed(results: Sequence[Result]) -> list[Result]:
+    """Those of the pictured results that know the cohort's test shapes."""
+    seed = pictured_seed(results)
+    return [one for one in _pictured(results) if one.seed == seed]
+
+
 def _opened(folder: Path, result: Result) -> ShapeModel | None:
     try:
         return open_bundle(folder / CELLS / result.key / "bundle", threads=1)
@@ -92,7 +110,7 @@ def _panel_a(folder: Path, results: Sequence[Result], cohort: Cohort | None, pic
         return [Panel(title, WITHHELD if not pictures else "Left out: the cohort could not be read.")]
     cases: dict[str, Case] = {case.name: case for case in cohort.test}
     found = []
-    shown = _pictured(results)
+    shown = _reconstructed(results)
     for trained, measured in dict.fromkeys((one.regime, name) for one in shown for name in one.measured):
         mine = {one.prior: one for one in shown if one.regime == trained}
         leading = mine.get(PriorName.FLOW_ARD.value) or next(iter(mine.values()))
@@ -142,7 +160,7 @@ def _panel_d(folder: Path, results: Sequence[Result], cohort: Cohort | None, pic
     title = "D. Uncertainty"
     if cohort is None:
         return [Panel(title, WITHHELD if not pictures else "Left out: the cohort could not be read.")]
-    result = next((one for one in _pictured(results) if one.prior == PriorName.FLOW_ARD.value), None)
+    result = next((one for one in _reconstructed(results) if one.prior == PriorName.FLOW_ARD.value), None)
     model = None if result is None else _opened(folder, result)
     cases = {case.name: case for case in cohort.test}
     if result is None or model is None:

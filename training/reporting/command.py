@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,12 +10,15 @@ import typer
 
 from model.errors import CohortError, InvalidParameter
 from training.cohorts.sources import open_cohort
-from training.console import check_output, exit_status, progress
+from training.console import exit_status, progress
+from training.outputs import ForceOption, check_new_files
 
 if TYPE_CHECKING:
     from training.reporting.page import Chapter
 
 PANELS = 5
+#: How the name of a page ends.
+PAGES = (".html", ".htm")
 
 
 def report(
@@ -29,6 +33,7 @@ def report(
         typer.Option("--published-only", help="Show shapes of those cohorts alone whose licence lets weights ship."),
     ] = False,
     command: Annotated[list[str] | None, typer.Option(help="A line on how the sweeps were made; may repeat.")] = None,
+    force: ForceOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="Write the result as JSON.")] = False,
 ) -> None:
     """Write the paper's tables and figure panels of sweeps as one HTML file and as CSV."""
@@ -36,7 +41,8 @@ def report(
         from training.reporting.page import page
         from training.reporting.tables import write_table
 
-        check_output(output, is_folder=False)
+        table = _table_beside(output)
+        check_new_files(output, table, force=force)
         _check_sweeps(sweeps)
         with progress(PANELS * len(sweeps), "drawing panels") as bar:
             chapters = [
@@ -45,10 +51,31 @@ def report(
             ]
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(page(title, chapters, command or ()), encoding="utf-8")
-        table = output.with_suffix(".csv")
         write_table([line for chapter in chapters for line in chapter.lines], table)
         summary = {"page": str(output), "table": str(table), "cohorts": [chapter.cohort for chapter in chapters]}
         typer.echo(json.dumps(summary) if as_json else f"{output} and {table} written")
+
+
+def _table_beside(output: Path) -> Path:
+    """The CSV file that goes with a page.
+
+    Raises:
+        InvalidParameter: the page is no HTML file, or the table would lie among those of a sweep.
+    """
+    from training.sweep.record import RECORD
+    from training.sweep.table import TABLE
+
+    if output.suffix.lower() not in PAGES:
+        raise InvalidParameter(
+            f"The page is written as HTML; a name that ends in {' or '.join(PAGES)} is accepted.", part="output"
+        )
+    table = output.with_suffix(".csv")
+    if any((folder / name).is_file() for folder in table.resolve().parents for name in (RECORD, TABLE)):
+        raise InvalidParameter(
+            "The page would lie in a sweep's folder, and its table among the sweep's own; another folder is accepted.",
+            part="output",
+        )
+    return table
 
 
 def _check_sweeps(sweeps: list[Path]) -> None:
@@ -68,7 +95,7 @@ def _check_sweeps(sweeps: list[Path]) -> None:
 
 
 def _chapter(folder: Path, pictures: bool, published_only: bool, watch: Callable[[str], None]) -> "Chapter":
-    from training.reporting.chapters import chapter_of
+    from training.reporting.chapters import chapter_of, pictured_seed
     from training.sweep.record import read_record
     from training.sweep.table import read_results
 
@@ -77,7 +104,8 @@ def _chapter(folder: Path, pictures: bool, published_only: bool, watch: Callable
     cohort = None
     if shown:
         try:
-            cohort = open_cohort(*read_record(folder))
+            source, options = read_record(folder)
+            cohort = open_cohort(source, replace(options, seed=pictured_seed(results)))
         except CohortError as error:
             typer.echo(f"{folder.name}: panels of shapes are left out: {error}", err=True)
     return chapter_of(folder, results, cohort, pictures=shown, watch=watch)

@@ -5,9 +5,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from training.report import spread
 from training.reporting.paper import PaperCell, paper_cell
 from training.sweep.priors import PriorName
-from training.sweep.summary import correlation, spread
+from training.sweep.summary import correlation
 from training.sweep.table import Result
 
 COLUMNS = ("asd_mm", "hd95_mm", "hd_mm", "dice")

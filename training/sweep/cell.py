@@ -1,8 +1,9 @@
 """One cell: train, export, calibrate, measure on test shapes, generate; what is there is skipped."""
 
 import shutil
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,27 +13,22 @@ import numpy as np
 from model.bundle import Manifest, ShapeModel, open_bundle, read_manifest
 from model.errors import InvalidParameter
 from training.calibration import PRECISIONS, calibrate_bundle, calibrate_bundle_as
-from training.choices import (
-    DeviceName,
-    ObjectiveName,
-    RegimeName,
-    configured,
-    with_batches,
-    with_duration,
-    with_patience,
-)
-from training.cohorts.cohort import Cohort
+from training.choices import DeviceName, ObjectiveName, RegimeName
+from training.cohorts.cohort import Case, Cohort
 from training.config import Regime, TrainingConfig
-from training.evaluate import Method, fills_of, measure
+from training.configuring import configured_for
+from training.evaluate import Method, fills_of, given_bundle, measure
 from training.generation import SAMPLES, generated
 from training.prior_choice import chosen_parts
 from training.pruning import PriorParts
 from training.release import UNCALIBRATED_PRECISION, active_dimensions, export_run
+from training.report import FIGURES
 from training.runs import CHECKPOINT, Run, is_finished, prepare
+from training.seen import check_unseen
 from training.sparsify import for_evaluation
-from training.sweep.plan import Cell
+from training.sweep.plan import Cell, cell_of
 from training.sweep.priors import PriorName
-from training.sweep.table import FIGURES, Result
+from training.sweep.table import Result
 
 #: Folders of a sweep.
 TRAININGS, CELLS = "trainings", "cells"
@@ -60,6 +56,16 @@ class Effort:
     samples: int = SAMPLES
     cases: int | None = None
     reflect: bool | None = None
+
+    def settings(self) -> dict[str, object]:
+        """What a user chose of it, under the names of the options."""
+        return {
+            "steps": TrainingConfig().steps if self.steps is None else self.steps,
+            "limit": "all" if self.cases is None else self.cases,
+            "samples": self.samples,
+            "patience": self.patience,
+            "calibrate": self.calibrate,
+        }
 
 
 @dataclass(frozen=True)
@@ -108,7 +114,7 @@ def run_cell(
     """Bring a cell to its result, from wherever an earlier attempt left it.
 
     Args:
-        known: whether the cohort is a public one, see `training.choices`.
+        known: whether the cohort is a public one, see `training.configuring`.
     """
     begin = time.perf_counter()
     if not place.is_exported:
@@ -147,34 +153,34 @@ def _parts(cell: Cell, place: Place, cohort: Cohort, effort: Effort) -> PriorPar
 
 def config_of(cell: Cell, cohort: Cohort, effort: Effort, device: DeviceName, *, known: bool) -> TrainingConfig:
     """The configuration of a cell's training."""
-    objective = ObjectiveName(cell.objective)
-    paired = effort.reflect
-    if paired is None:
-        paired = known and cohort.reflects and objective is not ObjectiveName.PAPER
-    config = configured(
-        objective,
+    return configured_for(
+        cohort,
+        ObjectiveName(cell.objective),
         RegimeName(cell.regime),
         cell.latent_size,
+        known=known,
+        reflect=effort.reflect,
         flow=cell.together and cell.prior.flow,
         ard=cell.together and cell.prior.ard,
-        reflected=paired,
+        steps=effort.steps,
+        patience=effort.patience,
         seed=cell.seed,
         device=device,
     )
-    codes = (2 if paired else 1) * len(cohort.train)
-    return with_patience(with_duration(with_batches(config, codes), effort.steps, None, codes), effort.patience)
 
 
 def result_of(cell: Cell, model: ShapeModel, cohort: Cohort, effort: Effort, seconds: float, watch: Watch) -> Result:
     """Measure an exported cell.
 
     Raises:
-        InvalidParameter: the cohort has no test shapes.
+        InvalidParameter: the cohort has no test shapes, or the model was trained on one that is measured.
     """
     if not cohort.test:
         raise InvalidParameter(
             "The cohort has no test shapes; one with a test split, or --test-fraction, is accepted.", part="cohort"
         )
+    cases = cohort.test[: effort.cases]
+    check_unseen(model.manifest, cases, "test")
     sigmas = relevance(model.manifest)
     drawn = generated(model, samples=effort.samples, watch=lambda number: watch("generating", number, effort.samples))
     return Result(
@@ -188,14 +194,14 @@ def result_of(cell: Cell, model: ShapeModel, cohort: Cohort, effort: Effort, sec
         source=cohort.source,
         licence=cohort.licence,
         shippable=cohort.provenance.shippable,
-        shapes=len(cohort.train),
+        shapes=shapes_of(model.manifest),
         steps=steps_of(model.manifest),
         seconds=round(seconds, 1),
         sigmas=sorted(sigmas, reverse=True),
         active=list(active_dimensions(np.array(sigmas))),
         latent=drawn.latent.round(4).tolist(),
         surface_mm=drawn.surface_mm.round(4).tolist(),
-        measured={regime: _measured(model, cohort, regime, effort, watch) for regime in cell.measured_in},
+        measured={regime: _measured(model, cases, regime, watch) for regime in cell.measured_in},
     )
 
 
@@ -205,17 +211,63 @@ def steps_of(manifest: Manifest) -> int:
     return int(config["steps"]) if isinstance(config, dict) else 0
 
 
+def shapes_of(manifest: Manifest) -> int:
+    """Shapes that a model was trained on, as its manifest says."""
+    facts: Any = manifest.training
+    return int(facts["shapes"])
+
+
 def relevance(manifest: Manifest) -> list[float]:
     """Sigmas by which dimensions are told relevant: of the prior that was fitted, else all that were trained."""
     facts: Any = manifest.training.get("pruned") or {}
     return list(facts["trained_sigmas"] if facts and not facts.get("fitted") else manifest.sigmas)
 
 
+def by_cell(bundles: Sequence[Path]) -> dict[Cell, Path]:
+    """Exported bundles under the cells that they belong to.
+
+    Raises:
+        InvalidParameter: one is not there, or two belong to one cell.
+    """
+    found: dict[Cell, Path] = {}
+    for bundle in bundles:
+        cell = cell_of(given_bundle(bundle))
+        if cell in found:
+            raise InvalidParameter(
+                f"Two bundles belong to the cell {cell.key}; one is accepted, the other in a folder of its own.",
+                part="bundle",
+            )
+        found[cell] = bundle
+    return found
+
+
 def adopt(bundle: Path, place: Place) -> None:
-    """Take an exported bundle as a cell's own."""
-    read_manifest(bundle)
+    """Take an exported bundle as a cell's own; other processes may do so at the same time.
+
+    Raises:
+        InvalidParameter: the cell has another one.
+    """
+    manifest = given_bundle(bundle)
     if not place.bundle.exists():
-        shutil.copytree(bundle, place.bundle)
+        _copy(bundle, place.bundle)
+    if read_manifest(place.bundle)[0] != manifest:
+        raise InvalidParameter(
+            f"The output folder holds another bundle as the cell {place.bundle.parent.name}; the same one, or an empty "
+            "folder, is accepted.",
+            part="bundle",
+        )
+
+
+def _copy(bundle: Path, target: Path) -> None:
+    """In one move, so that a folder that is there is a whole one; the first of several processes has its way."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix="adopting-") as folder:
+        whole = shutil.copytree(bundle, Path(folder) / target.name)
+        try:
+            whole.rename(target)
+        except OSError:
+            if not target.exists():
+                raise
 
 
 def _export(place: Place, cohort: Cohort, effort: Effort, parts: PriorParts | None) -> None:
@@ -237,10 +289,9 @@ def _calibrate(part: Path, place: Place, cohort: Cohort) -> None:
 
 
 def _measured(
-    model: ShapeModel, cohort: Cohort, regime: Regime, effort: Effort, watch: Watch
+    model: ShapeModel, cases: Sequence[Case], regime: Regime, watch: Watch
 ) -> dict[str, dict[str, float] | None]:
     fill = fills_of(model, 0)[Method.MODEL]
-    cases = cohort.test[: effort.cases]
     found: dict[str, dict[str, float] | None] = {}
     for number, case in enumerate(cases):
         drawing = for_evaluation(case.mask, case.grid, regime)

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from model.bundle import read_manifest
 from model.errors import InvalidParameter
 from training.choices import DeviceName, ObjectiveName, RegimeName, resolved
 from training.cohort_options import takes_cohort
 from training.cohorts import CohortOptions
 from training.cohorts.sources import CohortSource, open_cohort
-from training.console import BAD_INPUT_STATUS, FAULT_STATUS, exit_status, progress, tell_findings
+from training.console import BAD_INPUT_STATUS, FAULT_STATUS, exit_status, progress, tell_findings, warn
 from training.sweep.priors import PriorName
 
 if TYPE_CHECKING:
@@ -23,6 +22,8 @@ if TYPE_CHECKING:
 LATENT_SIZES = [16, 32, 64, 128, 256]
 REGIMES = [RegimeName.THIN, RegimeName.THICK, RegimeName.ORTHOGONAL]
 PRIORS = [PriorName.PLAIN, PriorName.FLOW_ARD]
+#: Validations without a better figure after which a training ends.
+PATIENCE = 5
 #: Seconds between two looks at the workers.
 LOOK_S = 0.5
 
@@ -39,8 +40,12 @@ def sweep(
     objective: Annotated[ObjectiveName, typer.Option(help="What is minimised.")] = ObjectiveName.VARIATIONAL,
     steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps of each cell.")] = None,
     patience: Annotated[
-        int, typer.Option(min=0, help="End after so many validations without a better figure; 0 never does.")
-    ] = 5,
+        int | None,
+        typer.Option(
+            min=0,
+            help=f"End after so many validations without a better figure, {PATIENCE} when left out; 0 never does.",
+        ),
+    ] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate/--no-calibrate", help="Calibrate each training.")] = True,
     samples: Annotated[int, typer.Option(min=0, help="Generated shapes of each cell.")] = 1500,
     limit: Annotated[int | None, typer.Option(min=1, help="Measure only so many cases.")] = None,
@@ -53,19 +58,23 @@ def sweep(
 ) -> None:
     """Train and measure many models side by side, cell by cell; what is there is skipped."""
     with exit_status():
-        from training.sweep.cell import Effort, Place, adopt
-        from training.sweep.plan import cell_of, cells_of
+        from training.configuring import check_patience
+        from training.sweep.cell import Effort, Place, adopt, by_cell
+        from training.sweep.plan import cells_of
         from training.sweep.record import write_record
         from training.sweep.workers import Sweep
 
+        given = by_cell(bundle or ())
         found = open_cohort(source, options)
         tell_findings(found)
         if not found.test:
             raise InvalidParameter(
                 "The cohort has no test shapes; one with a test split, or --test-fraction, is accepted.", part="cohort"
             )
-        write_record(output, source, options)
-        given = {cell_of(read_manifest(path)[0]): path for path in bundle or ()}
+        check_patience(found, patience)
+        effort = Effort(steps, PATIENCE if patience is None else patience, calibrate, samples, limit)
+        if not write_record(output, source, options, effort.settings()):
+            warn("the sweep in the output folder is of an earlier version, whose settings are not known")
         for cell, path in given.items():
             adopt(path, Place.of(output, cell))
         sizes, regimes, priors = latent_size or LATENT_SIZES, regime or REGIMES, prior or PRIORS
@@ -81,7 +90,6 @@ def sweep(
             )
         )
         cells = tuple(dict.fromkeys([*given, *asked]))
-        effort = Effort(steps, patience, calibrate, samples, limit)
         _run(Sweep(source, options, cells, output, effort, device), jobs, as_json=as_json)
 
 

@@ -7,14 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from training.generation import Generation
-from training.sweep.table import FIGURES, Result
+from training.report import FIGURES, spread
+from training.sweep.table import Result
 
 CSV = "results.csv"
-
-
-def spread(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and population standard deviation; not numbers when there are no values."""
-    return (float(np.mean(values)), float(np.std(values))) if values else (float("nan"), float("nan"))
 
 
 def correlation(result: Result) -> float:

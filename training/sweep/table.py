@@ -9,7 +9,6 @@ from typing import Any
 from model.errors import InvalidParameter
 
 TABLE = "results.jsonl"
-FIGURES = ("dice", "asd_mm", "hd95_mm", "hd_mm")
 
 
 @dataclass(frozen=True)
@@ -20,12 +19,13 @@ class Result:
         key: of the cell; the fields after it are the cell's.
         cohort, source, licence: of the shapes.
         shippable: whether weights, and so pictures, of these shapes may be published.
+        shapes: of the training.
         steps: optimiser steps that were asked for; fewer are run where early stopping ends them.
         seconds: of the last attempt at the cell.
         sigmas: of the base, largest first.
         active: dimensions for 95, 97 and 99 % of the base variance.
         latent, surface_mm: of the generated shapes, see `training.generation`.
-        measured: by regime and case the figures of `FIGURES`; None where the drawing could not be taken.
+        measured: by regime and case the figures of `training.report`; None where the drawing could not be taken.
     """
 
     key: str

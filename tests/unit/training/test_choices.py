@@ -2,6 +2,7 @@
 
 import pytest
 
+from model.errors import InvalidParameter
 from training.choices import DeviceName, ObjectiveName, RegimeName, configured, with_batches, with_duration
 from training.config import TrainingConfig
 
@@ -24,6 +25,13 @@ def test_options_reach_the_configuration():
 def test_the_weight_of_relevance_determination_is_a_choice(objective):
     assert built(objective, ard_weight=7e-5).objective.lambda_ard == 7e-5
     assert built(objective).objective.lambda_ard == 1e-4
+
+
+def test_a_weight_of_relevance_determination_that_does_not_act_is_refused():
+    for ard in (False, None):
+        with pytest.raises(InvalidParameter, match="--ard-weight would do nothing; it is accepted with --ard"):
+            built(ard=ard, ard_weight=7e-5)
+    assert built(ObjectiveName.CENTRED, ard=None, ard_weight=7e-5).objective.lambda_ard == 7e-5
 
 
 def test_the_paper_is_selectable_as_written():

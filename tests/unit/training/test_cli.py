@@ -1,6 +1,7 @@
 import csv
 import json
 import shutil
+from dataclasses import replace
 
 import nibabel as nib
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from model.bundle import open_bundle, read_manifest
+from model.bundle import open_bundle, read_manifest, write_manifest
 from training.calibration import SHARES
 from training.cli import register
 from training.cohorts import CohortOptions
@@ -136,10 +137,25 @@ class TestTrain:
             (("calibrate", tmp_path), "has no manifest.json"),
             (("evaluate", "--model", tmp_path / "gone"), "folder of the model does not exist"),
             (("evaluate", "--model", "talus", "--output", tmp_path / "file" / "x"), "output cannot be written"),
+            (("evaluate", "--model", "talus", "--output", tmp_path / "file"), "file exists; another name, or --force"),
+            (("evaluate", "--model", "talus", "--record", "--limit", 1), "without --limit and --offset"),
+            (("evaluate", "--model", "talus", "--record", "--offset", 0), "without --limit and --offset"),
         ):
             result = run(*words, "--masks", "nowhere")
             assert result.exit_code == 2
             assert sentence in result.stderr
+        assert (tmp_path / "file").read_text() == "here"
+
+    def test_patience_without_validation_shapes_is_refused(self, run, masks, tmp_path):
+        """All shapes are one person's, of whom none can be held out."""
+        lines = [f"e{n},one,train" for n in range(6)] + ["e6,other,test"]
+        (masks / "cases.csv").write_text("\n".join(["case,person,split", *lines]))
+        words = ("train", "--masks", masks, *SMALL, "--output", tmp_path / "run")
+        result = run(*words, "--patience", 2)
+        assert result.exit_code == 2
+        assert "no validation cases by which a training could end early" in result.stderr
+        assert not (tmp_path / "run").exists()
+        assert run(*words, "--patience", 0).exit_code == 0
 
     def test_a_single_shape_is_refused_and_few_are_told_of(self, run, masks, tmp_path):
         write(tmp_path / "one", "e", ellipsoid(0))
@@ -210,6 +226,14 @@ class TestExport:
         result = run(*words, "--seed", next(others).seed)
         assert result.exit_code == 2
         assert "was trained on" in result.stderr
+
+    @pytest.mark.parametrize("option", ["--training-share", "--least-movement"])
+    def test_what_would_be_pruned_is_said_where_something_is(self, run, bundle, tmp_path, option):
+        words = ("export", bundle.parent / "run", "--output", tmp_path / "out", "--no-prune", option, 0.2)
+        result = run(*words)
+        assert result.exit_code == 2
+        assert "Nothing is pruned" in result.stderr
+        assert not (tmp_path / "out").exists()
 
     def test_a_cohort_where_nothing_is_chosen_is_refused(self, run, bundle, tmp_path):
         words = ("export", bundle.parent / "run", "--output", tmp_path / "out", "--masks", bundle.parent / "masks")
@@ -288,9 +312,11 @@ class TestComplete:
 
     def test_a_model_without_one_has_no_weight_to_choose(self, run, bundle, tmp_path):
         plain = shutil.copytree(bundle, tmp_path / "plain")
+        write_manifest(replace(read_manifest(plain)[0], accuracy={"test/thin": {"dice": 0.9}}), plain)
         result = run("calibrate", plain, "--masks", bundle.parent / "masks", "--json")
         assert result.exit_code == 0, result.stderr
-        assert read_manifest(plain)[0].completion == {}
+        manifest, _ = read_manifest(plain)
+        assert (manifest.completion, manifest.accuracy) == ({}, {})
         assert "completion_share" not in json.loads(result.stdout)
 
     def test_a_folder_without_a_bundle_is_refused_before_anything_is_trained(self, run, masks, tmp_path):
@@ -320,9 +346,11 @@ class TestEvaluate:
         assert [float(line["dice"]) for line in lines] == pytest.approx(
             [row["figures"]["dice"]["mean"] for row in rows]
         )
-        text = run(*words)
+        (tmp_path / "new" / "cases.csv").write_text("of another time")
+        text = run(*words, "--output", tmp_path / "new" / "cases.csv", "--force")
         assert text.exit_code == 0
         assert len(text.stdout.splitlines()) == 6
+        assert len((tmp_path / "new" / "cases.csv").read_text().splitlines()) == 6
 
     def test_validation_cases_can_be_measured_and_limited(self, run, bundle, masks):
         words = ("evaluate", "--model", bundle, "--masks", masks, "--split", "validation", "--limit", 1)

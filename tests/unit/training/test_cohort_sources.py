@@ -7,15 +7,21 @@ import pytest
 import SimpleITK as sitk
 import trimesh
 from scipy.spatial.transform import Rotation
+from vtkmodules.util.numpy_support import numpy_to_vtk
+from vtkmodules.vtkCommonDataModel import vtkImageData
+from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D
 
 from model.errors import CohortError, InvalidParameter
 from model.geometry import Grid
 from training.cohorts import Case, CohortName, CohortOptions
 from training.cohorts.alignment import align
 from training.cohorts.assemble import assemble
-from training.cohorts.cohort import Provenance
+from training.cohorts.cohort import Provenance, SideName
+from training.cohorts.meshes import voxelised
 from training.cohorts.sources import CohortSource, LayoutName, open_cohort
-from training.cohorts.voxelising import SpaceName
+from training.cohorts.verse import split_of
+from training.cohorts.voxelising import SpaceName, Voxelising
+from training.seen import short_digest
 
 OPTIONS = CohortOptions(validation_fraction=0.0)
 
@@ -46,6 +52,32 @@ class TestSource:
     def test_a_layout_belongs_to_masks(self, tmp_path):
         with pytest.raises(InvalidParameter, match="--layout goes with --masks"):
             opened(meshes=tmp_path, layout=LayoutName.VERSE)
+
+    @pytest.mark.parametrize(
+        ("source", "option"),
+        [
+            ({"meshes": Path(), "labels": (3,)}, "--label"),
+            ({"masks": Path(), "layout": LayoutName.MEDMNIST, "labels": (3,)}, "--label"),
+            ({"cohort": CohortName.TALUS, "labels": (3,)}, "--label"),
+            ({"masks": Path(), "spacing_mm": 2.0}, "--spacing-mm"),
+            ({"cohort": CohortName.TALUS, "spacing_mm": 2.0}, "--spacing-mm"),
+            ({"masks": Path(), "space": SpaceName.LPS}, "--mesh-space"),
+            ({"masks": Path(), "layout": LayoutName.MEDMNIST, "space": SpaceName.LPS}, "--mesh-space"),
+            ({"masks": Path(), "data": Path()}, "--data"),
+            ({"cohort": CohortName.TALUS, "side": SideName.LEFT}, "--side"),
+        ],
+    )
+    def test_an_option_that_would_do_nothing_is_refused(self, source, option):
+        with pytest.raises(InvalidParameter, match=f"{option} would do nothing here; {option} goes with"):
+            opened(**source)
+
+    def test_the_side_is_not_stated_until_a_caller_says_it(self, tmp_path):
+        for n in range(3):
+            save(tmp_path / f"b{n}.nii.gz", ball(5.0 + 0.2 * n))
+        assert opened(masks=tmp_path).side == "not stated"
+        assert not opened(masks=tmp_path).reflects
+        for side in SideName:
+            assert opened(masks=tmp_path, side=side).side == side
 
     def test_test_persons_are_held_out_where_there_are_none(self, tmp_path):
         for n in range(10):
@@ -115,6 +147,47 @@ class TestMeshes:
         assert [int(case.mask.sum()) for case in found.train] == [10 * 12 * (8 + 2 * n) for n in range(3)]
 
 
+class TestMeshOfVoxels:
+    """A surface made by marching cubes has its faces half-way between the voxels that it was made of."""
+
+    @pytest.fixture
+    def mask(self):
+        index = np.stack(np.meshgrid(*[np.arange(28)] * 3, indexing="ij"), axis=-1)
+        bump = ((index - [20.0, 18.0, 13.5]) ** 2).sum(axis=-1) <= 16.0
+        return bump | ((((index - 13.5) / [10.0, 8.0, 6.0]) ** 2).sum(axis=-1) <= 1.0)
+
+    def surface(self, mask, shift=(0.0, 0.0, 0.0)):
+        image, cubes = vtkImageData(), vtkFlyingEdges3D()
+        image.SetDimensions(*mask.shape)
+        image.SetOrigin(*shift)
+        image.GetPointData().SetScalars(numpy_to_vtk(mask.astype(np.float32).ravel(order="F"), deep=True))
+        cubes.SetInputData(image)
+        cubes.SetValue(0, 0.5)
+        cubes.Update()
+        return cubes.GetOutput()
+
+    @pytest.mark.parametrize(
+        "shift", [(0, 0, 0), (0.5, 0.5, 0.5), (0.001, 0.001, 0.001), (-0.001, -0.001, -0.001), (0.1, 0.37, -0.42)]
+    )
+    @pytest.mark.parametrize(("spacing_mm", "tolerance_mm"), [(1.0, 0.02), (0.5, 0.12), (0.7, 0.12)])
+    def test_volume_and_centroid_are_right_wherever_it_lies(self, mask, shift, spacing_mm, tolerance_mm):
+        found = voxelised(self.surface(mask, shift), Voxelising(spacing_mm), "voxels")
+        assert found.mask.sum() * spacing_mm**3 == pytest.approx(mask.sum(), rel=0.02)
+        centroid = found.grid.to_world(np.argwhere(found.mask).astype(float)).mean(axis=0)
+        assert centroid == pytest.approx(np.argwhere(mask).mean(axis=0) + shift, abs=tolerance_mm)
+        assert np.array_equal(found.mask, voxelised(self.surface(mask), Voxelising(spacing_mm), "voxels").mask)
+
+    @pytest.mark.parametrize("space", list(SpaceName))
+    def test_at_its_own_spacing_it_is_the_mask_again_with_room_around_it(self, mask, space):
+        found = voxelised(self.surface(mask), Voxelising(1.0, space), "voxels")
+        voxels, before = np.argwhere(found.mask), np.argwhere(mask)
+        assert np.array_equal(voxels - voxels.min(axis=0), before - before.min(axis=0))
+        assert (voxels.min(axis=0) >= 4).all()
+        assert (np.array(found.mask.shape) - 1 - voxels.max(axis=0) >= 4).all()
+        sign = -1.0 if space is SpaceName.LPS else 1.0
+        assert found.grid.to_world(voxels.astype(float)) == pytest.approx(before * [sign, sign, 1.0], abs=0.01)
+
+
 class TestDecathlon:
     def write(self, root, listed=True):
         names = [f"hippocampus_{n:03d}.nii.gz" for n in range(4)]
@@ -135,6 +208,23 @@ class TestDecathlon:
         self.write(tmp_path)
         save(tmp_path / "labelsTs" / "hippocampus_900.nii.gz", ball(5.5))
         assert [case.name for case in opened(masks=tmp_path, layout=LayoutName.DECATHLON).test] == ["hippocampus_900"]
+
+    @pytest.mark.parametrize("split", [{}, {"split": ""}])
+    def test_a_table_of_persons_leaves_the_test_cases_where_they_are(self, tmp_path, split):
+        self.write(tmp_path)
+        save(tmp_path / "labelsTs" / "hippocampus_900.nii.gz", ball(5.5))
+        rows = [{"case": f"hippocampus_{n:03d}", "person": f"p{n // 2}", **split} for n in (0, 1, 2, 3, 900)]
+        lines = [",".join(rows[0]), *(",".join(row.values()) for row in rows)]
+        (tmp_path / "cases.csv").write_text("\n".join(lines))
+        found = opened(masks=tmp_path, layout=LayoutName.DECATHLON)
+        assert [(case.name, case.person) for case in found.test] == [("hippocampus_900", "p450")]
+        assert len({case.person for case in found.train}) == 2
+
+    def test_a_table_may_say_another_split(self, tmp_path):
+        self.write(tmp_path)
+        save(tmp_path / "labelsTs" / "hippocampus_900.nii.gz", ball(5.5))
+        (tmp_path / "cases.csv").write_text("case,split\nhippocampus_900,train\nhippocampus_000,test\n")
+        assert [case.name for case in opened(masks=tmp_path, layout=LayoutName.DECATHLON).test] == ["hippocampus_000"]
 
     def test_a_label_that_is_missing_is_named(self, tmp_path):
         self.write(tmp_path)
@@ -220,6 +310,21 @@ class TestVerse:
         assert world == pytest.approx((self.AFFINE @ [12.0, 9.0, 9.0, 1.0])[:3], abs=0.05)
         assert found.provenance.shippable
 
+    @pytest.mark.parametrize(
+        ("root", "below", "split"),
+        [
+            ("latest-verse", "derivatives", "train"),
+            ("test", "latest/derivatives", "train"),
+            ("verse", "dataset-verse19test/derivatives", "test"),
+            ("verse", "dataset-03test/derivatives", "test"),
+            ("verse", "dataset-02Validation/derivatives", "validation"),
+            ("verse", "test/latest/derivatives", "test"),
+            ("test", "dataset-01training/derivatives", "train"),
+        ],
+    )
+    def test_whole_words_below_the_root_say_the_split(self, root, below, split):
+        assert split_of(Path(root) / below / "sub-verse004" / "mask.nii.gz", Path(root)) == split
+
     @pytest.mark.parametrize("direction", ["PSL", "ASR", "LPS", "RAI"])
     def test_centroids_are_understood_along_any_axes(self, tmp_path, direction):
         for n in range(2):
@@ -275,6 +380,7 @@ class TestOaiZib:
         found = opened(CohortOptions(), masks=tmp_path, layout=LayoutName.OAI_ZIB)
         everything = {case.name: case for case in found.cases}
         assert len(everything) == 7
+        assert found.side == "mixed"
         assert everything["9001100.segmentation_masks"].person == everything["9001100_V01"].person == "9001100"
         assert int(everything["9001101.segmentation_masks"].mask.sum()) == int(ball(5.2).sum())
         assert sorted(everything["9001101.segmentation_masks"].grid.spacing) == pytest.approx([0.36, 0.36, 0.7])
@@ -307,7 +413,10 @@ class TestAlignment:
         grid = Grid((48, 48, 48), np.eye(4))
         cases = [Case(f"l{n}", f"l{n}", "train", self.bars(turn, rng), grid) for n, turn in enumerate(turns)]
         cohort = assemble("l", cases, (), Provenance("made here", "CC0", "", shippable=True), CohortOptions())
-        found = align(cohort)
+        told = []
+        found = align(cohort, lambda done, total: told.append((done, total)))
+        steps = 3 * len(cohort.train) + len(cohort.validation)
+        assert told == [(n, steps) for n in range(1, steps + 1)]
         before = {case.name: case for case in cohort.cases}
         after = {case.name: case for case in found.cases}
         names = sorted(after)
@@ -315,4 +424,5 @@ class TestAlignment:
         assert max(self.spread([after[name] for name in names], turns)) < np.deg2rad(3.0)
         for name in names:
             assert np.array_equal(before[name].mask, after[name].mask)
+            assert short_digest(before[name]) == short_digest(after[name])
             assert after[name].grid.spacing == pytest.approx([1.0, 1.0, 1.0])

@@ -13,7 +13,15 @@ from model.geometry import Grid
 from training.cohorts import Case, CohortName, CohortOptions, Provenance, data_folder, load_cohort, read_folder
 from training.cohorts.assemble import assemble
 from training.cohorts.cohort import divided_persons, hold_out
-from training.cohorts.inspect import copies, findings_of, outliers, part_sizes, touches_border, without_specks
+from training.cohorts.inspect import (
+    copies,
+    findings_of,
+    outliers,
+    part_sizes,
+    shape_digest,
+    touches_border,
+    without_specks,
+)
 from training.cohorts.reading import read_mask
 
 OWN = Provenance("made here", "CC0", "nobody", shippable=True)
@@ -45,6 +53,22 @@ def write_table(folder, rows):
         writer = csv.DictWriter(stream, rows[0].keys())
         writer.writeheader()
         writer.writerows(rows)
+
+
+def lopsided():
+    """A ball with a bump, which no turn or reflection maps onto itself."""
+    return ball() | ball(3.0, 20, (15.0, 13.0, 11.0))
+
+
+def restored(mask, affine, axes, flips):
+    """The same voxels at the same places, axes stored in another order and some of them backwards."""
+    change = np.zeros((4, 4))
+    change[3, 3] = 1.0
+    for new, (old, flip) in enumerate(zip(axes, flips, strict=True)):
+        change[old, new] = -1.0 if flip else 1.0
+        change[old, 3] = mask.shape[old] - 1 if flip else 0.0
+    stored = mask.transpose(axes)[tuple(slice(None, None, -1 if flip else 1) for flip in flips)]
+    return np.ascontiguousarray(stored), affine @ change
 
 
 def write_balls(folder, count=6):
@@ -137,8 +161,15 @@ class TestSplits:
 
     def test_a_person_in_two_splits_is_refused(self):
         cases = [*balls(), case("t", ball(4.0), split="test", person="c0")]
-        with pytest.raises(CohortError, match="more than one split"):
+        with pytest.raises(CohortError, match=r"1 person\(s\) stand in more than one split \(c0\)"):
             assemble("balls", cases, (), OWN, CohortOptions(validation_fraction=0.0))
+
+    def test_where_nothing_is_left_to_train_on_the_other_splits_are_counted(self):
+        cases = [case(f"t{n}", ball(4.0 + 0.3 * n), split="test") for n in range(3)]
+        with pytest.raises(CohortError, match=r"left to train on \(0 train, 0 validation, 3 test\)$"):
+            assemble("balls", cases, (), OWN, CohortOptions())
+        with pytest.raises(CohortError, match="NIfTI, NRRD or MetaImage is accepted"):
+            assemble("balls", (), (), OWN, CohortOptions())
 
 
 class TestInspection:
@@ -181,6 +212,32 @@ class TestInspection:
         assert [(refusal.name, refusal.stops) for refusal in found] == [("first", False)]
         assert "moved" in found[0].reason
 
+    @given(
+        axes=st.permutations(range(3)),
+        flips=st.tuples(*[st.booleans()] * 3),
+        turn=st.tuples(*[st.floats(-0.25, 0.25)] * 3),
+        spacing=st.tuples(*[st.sampled_from([0.3125, 0.390625, 0.6667, 0.7, 0.78125, 0.9765625, 1.0])] * 3),
+    )
+    def test_a_digest_does_not_depend_on_how_the_axes_are_stored(self, axes, flips, turn, spacing):
+        mask, affine = lopsided(), np.diag([*spacing, 1.0])
+        affine[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ affine[:3, :3]
+        stored, moved = restored(mask, affine, axes, flips)
+        digest = shape_digest(mask, Grid(mask.shape, affine))
+        rounded = moved.astype(np.float32).astype(float)
+        assert shape_digest(stored, Grid(stored.shape, rounded)) == digest
+
+    def test_stored_otherwise_a_mask_is_a_copy_and_mirrored_or_of_another_size_it_is_none(self):
+        mask, affine = lopsided(), np.eye(4)
+        stored, moved = restored(mask, affine, (2, 0, 1), (True, True, False))
+        mirrored = np.diag([-1.0, 1.0, 1.0, 1.0])
+        cases = [
+            Case("one", "one", "train", mask, Grid(mask.shape, affine)),
+            Case("again", "again", "train", stored, Grid(stored.shape, moved)),
+            Case("mirrored", "mirrored", "train", mask, Grid(mask.shape, mirrored)),
+            case("larger", mask, spacing=1.5),
+        ]
+        assert [refusal.name for refusal in copies(cases)] == ["again"]
+
     @given(factor=st.floats(0.2, 5.0))
     def test_outliers_do_not_depend_on_the_unit(self, factor):
         strange = case("strange", ball(9.0), spacing=4.0 * factor)
@@ -212,6 +269,27 @@ class TestFolder:
             write(tmp_path / ("test" if n < 2 else "train"), f"b{n}", ball(5 + 0.3 * n))
         cohort = read_folder(tmp_path, CohortOptions())
         assert {found.name for found in cohort.test} == {"b0", "b1"}
+
+    @pytest.mark.parametrize("deeper", ["sub-{n}", "Train/sub-{n}/anat", ""])
+    def test_the_innermost_folder_that_is_named_after_a_split_says_it(self, tmp_path, deeper):
+        root = tmp_path / "train" / "cohort"
+        for n in range(6):
+            folder = deeper.replace("{n}", str(n)) if n > 1 else deeper.replace("{n}", str(n)).replace("Train", "TEST")
+            write(root / ("Test" if n < 2 else "TRAIN") / folder, f"b{n}", ball(5 + 0.3 * n))
+        cohort = read_folder(root, CohortOptions(validation_fraction=0.0))
+        assert {found.name for found in cohort.test} == {"b0", "b1"}
+        assert len(cohort.train) == 4
+
+    def test_only_folders_below_the_root_say_a_split(self, tmp_path):
+        write_balls(tmp_path / "test" / "cohort")
+        cohort = read_folder(tmp_path / "test" / "cohort", CohortOptions())
+        assert (len(cohort.train), len(cohort.test)) == (5, 0)
+
+    def test_an_empty_cell_leaves_the_split_to_the_folder(self, tmp_path):
+        for n in range(6):
+            write(tmp_path / ("test" if n < 2 else "train"), f"b{n}", ball(5 + 0.3 * n))
+        write_table(tmp_path, [{"case": f"b{n}", "person": f"p{n}", "split": ""} for n in range(6)])
+        assert {found.name for found in read_folder(tmp_path, CohortOptions()).test} == {"b0", "b1"}
 
     def test_the_table_decides(self, tmp_path):
         write_balls(tmp_path)
@@ -250,8 +328,40 @@ class TestFolder:
     def test_an_unknown_split_is_refused(self, tmp_path):
         write_balls(tmp_path)
         write_table(tmp_path, [{"case": "ball0", "split": "holiday"}])
-        with pytest.raises(CohortError, match="train, validation or test"):
+        with pytest.raises(CohortError, match="unknown split, holiday; train, validation or test"):
             read_folder(tmp_path, CohortOptions())
+
+    @pytest.mark.parametrize("column", ["person", "subject", "patient"])
+    @pytest.mark.parametrize("separator", [",", ";", "\t"])
+    def test_tables_of_spreadsheets_are_read(self, tmp_path, column, separator):
+        write_balls(tmp_path)
+        lines = [["Case", column.title(), "SPLIT"], *([f"ball{n}", f"Mü{n // 2}", "Test "] for n in range(2))]
+        text = "\r\n".join(separator.join(line) for line in lines) + "\r\n"
+        (tmp_path / "cases.csv").write_bytes(text.encode("utf-8-sig"))
+        found = read_folder(tmp_path, CohortOptions()).test
+        assert [(one.name, one.person) for one in found] == [("ball0", "Mü0"), ("ball1", "Mü0")]
+
+    @pytest.mark.parametrize(
+        ("table", "reason"),
+        [
+            ("case,person\nball0,Müller\n".encode("latin-1"), "UTF-8"),
+            (b'case,person\nball0,"open\nball1,p1\n', "cannot be read"),
+            (b"case,person\nball0," + 200_000 * b"x" + b"\n", "cannot be read"),
+            (b"case,person\nball0,Doe, John\n", "more cells than columns"),
+            (b"name,person\nball0,p0\n", "no column case, its columns are name, person"),
+            (b"case,split,patient_id\nball0,test,p0\n", "no column person, and patient_id is not read"),
+        ],
+    )
+    def test_a_table_that_would_be_misread_is_refused(self, tmp_path, table, reason):
+        write_balls(tmp_path)
+        (tmp_path / "cases.csv").write_bytes(table)
+        with pytest.raises(CohortError, match=reason):
+            read_folder(tmp_path, CohortOptions())
+
+    def test_further_columns_beside_persons_do_no_harm(self, tmp_path):
+        write_balls(tmp_path)
+        write_table(tmp_path, [{"case": f"ball{n}", "person": f"p{n // 3}", "age": "40"} for n in range(6)])
+        assert len({found.person for found in read_folder(tmp_path, CohortOptions()).cases}) == 2
 
     def test_nothing_at_all_is_refused(self, tmp_path):
         with pytest.raises(CohortError):

@@ -7,15 +7,17 @@ import torch
 
 from model.errors import InvalidParameter
 from model.geometry import Grid
+from model.manifest_values import SIDES
 from model.networks.decoder import DecoderShape
 from model.networks.flow import FlowShape
 from model.networks.prior import PriorShape
 from tests.analytic_shapes import Ellipsoid
 from training.cohorts import Case, Cohort, Provenance
+from training.cohorts.cohort import NOT_STATED, SideName
 from training.config import TrainingConfig
 from training.interruption import Stopped
 from training.release import active_dimensions
-from training.runs import half_extent, mask_digest, read_record, train_cohort
+from training.runs import half_extent, mask_digest, read_record, record, train_cohort
 
 GRID = Grid((24, 24, 24), np.diag([1.0, 1.0, 1.0, 1.0]))
 CONFIG = TrainingConfig(
@@ -99,6 +101,11 @@ def test_the_record_gives_the_configuration_back(tmp_path):
     assert list(record["train"]) == [f"e{n}" for n in range(4)]
     with pytest.raises(InvalidParameter, match="no training run"):
         read_record(tmp_path / "elsewhere")
+
+
+def test_sides_are_recorded_as_manifests_hold_them():
+    found = {side: record(replace(ellipsoids(), side=side), CONFIG)["side"] for side in (*SideName, NOT_STATED)}
+    assert found == {side: side for side in SIDES} | {NOT_STATED: "mixed"}
 
 
 def test_a_digest_depends_on_voxels_and_place():

@@ -2,6 +2,7 @@ import csv
 import json
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -18,13 +19,16 @@ from typer.testing import CliRunner
 
 from model.bundle import read_manifest, write_manifest
 from model.errors import InvalidParameter
+from training.calibration import calibrate_bundle_as
 from training.choices import DeviceName
 from training.cli import register
 from training.cohorts import CohortOptions
-from training.cohorts.sources import CohortSource, open_cohort
+from training.cohorts.sources import CohortSource, LayoutName, open_cohort
 from training.prior_choice import chosen_parts
 from training.pruning import PriorParts
-from training.sweep.cell import Effort
+from training.report import FIGURES
+from training.reporting.chapters import pictured_seed
+from training.sweep.cell import Effort, Place, adopt
 from training.sweep.plan import Cell, by_training, cells_of
 from training.sweep.priors import PriorName
 from training.sweep.record import read_record, write_record
@@ -33,6 +37,7 @@ from training.sweep.summary import correlation, row_of, write_csv
 from training.sweep.table import Result, append, done, read_results
 from training.sweep.workers import Sweep, held, refusals, work, work_together
 
+EFFORT = Effort(steps=8, calibrate=False, samples=4)
 QUICK = [
     "--latent-size",
     "3",
@@ -152,15 +157,51 @@ class TestHolding:
 
 class TestRecord:
     def test_source_and_options_come_back(self, tmp_path):
-        source = CohortSource(masks=tmp_path, labels=(2, 3), align=True)
+        source = CohortSource(masks=tmp_path, labels=(2, 3), layout=LayoutName.VERSE, align=True)
         options = CohortOptions(test_fraction=0.2, skip_refused=True)
-        write_record(tmp_path / "s", source, options)
-        assert read_record(tmp_path / "s") == (source, options)
+        for _ in range(2):
+            assert write_record(tmp_path / "s", source, replace(options, seed=5), EFFORT.settings())
+            found = read_record(tmp_path / "s")
+            assert found == (source, options)
+            assert [type(value) for value in vars(found[0]).values()] == [
+                type(value) for value in vars(source).values()
+            ]
+        assert [path.name for path in (tmp_path / "s").iterdir()] == ["sweep.json"]
 
     def test_a_sweep_of_other_shapes_is_refused(self, tmp_path):
-        write_record(tmp_path / "s", CohortSource(masks=tmp_path), CohortOptions())
+        write_record(tmp_path / "s", CohortSource(masks=tmp_path), CohortOptions(), {})
         with pytest.raises(InvalidParameter, match="other shapes"):
-            write_record(tmp_path / "s", CohortSource(masks=tmp_path / "more"), CohortOptions())
+            write_record(tmp_path / "s", CohortSource(masks=tmp_path / "more"), CohortOptions(), {})
+
+    @pytest.mark.parametrize(
+        ("changes", "words"),
+        [
+            ({"steps": 9, "samples": 5}, "steps: 8 there, 9 asked"),
+            ({"steps": None}, "steps: 8 there, 8000 asked"),
+            ({"cases": 1}, "limit: all there, 1 asked"),
+            ({"samples": 5}, "samples: 4 there, 5 asked"),
+            ({"patience": 5}, "patience: 0 there, 5 asked"),
+            ({"calibrate": True}, "calibrate: False there, True asked"),
+        ],
+    )
+    def test_a_sweep_with_other_settings_is_refused_and_the_first_is_named(self, tmp_path, changes, words):
+        source = CohortSource(masks=tmp_path)
+        write_record(tmp_path / "s", source, CohortOptions(), EFFORT.settings())
+        before = (tmp_path / "s" / "sweep.json").read_bytes()
+        with pytest.raises(InvalidParameter, match=words):
+            write_record(tmp_path / "s", source, CohortOptions(), replace(EFFORT, **changes).settings())
+        assert (tmp_path / "s" / "sweep.json").read_bytes() == before
+
+    def test_a_sweep_that_recorded_no_settings_is_read_and_goes_on_without_them(self, tmp_path):
+        source, path = CohortSource(masks=tmp_path), tmp_path / "sweep.json"
+        write_record(tmp_path, source, CohortOptions(), EFFORT.settings())
+        values = json.loads(path.read_text(encoding="utf-8"))
+        del values["settings"]
+        values["source"]["data"] = "/of/public/cohorts"  # of the environment, and of no use
+        path.write_text(json.dumps(values), encoding="utf-8")
+        assert not write_record(tmp_path, source, CohortOptions(), replace(EFFORT, steps=9).settings())
+        assert read_record(tmp_path) == (source, CohortOptions())
+        assert json.loads(path.read_text(encoding="utf-8")) == values
 
 
 @pytest.fixture(scope="module")
@@ -168,6 +209,45 @@ def swept(masks, tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweep") / "out"
     words = ("sweep", "--masks", masks, *QUICK, "--output", folder, "--jobs", 1, "--json")
     return folder, words, call(*words)
+
+
+class TestReport:
+    """What is written, and what is not written over."""
+
+    @pytest.fixture
+    def folder(self, tmp_path):
+        (tmp_path / "sweep").mkdir()
+        append(tmp_path / "sweep", result(measured={"thin": {"one": dict.fromkeys(FIGURES, 0.5)}}))
+        (tmp_path / "sweep" / "results.csv").write_text("the sweep's own")
+        return tmp_path / "sweep"
+
+    def report(self, folder, *words):
+        return call("report", folder, "--no-pictures", "--output", *words)
+
+    @pytest.mark.parametrize("name", ["page.csv", "page", "page.html.txt"])
+    def test_other_files_than_html_are_refused(self, folder, tmp_path, name):
+        answer = self.report(folder, tmp_path / name, "--force")
+        assert answer.exit_code == 2
+        assert "ends in .html or .htm" in answer.stderr
+        assert not (tmp_path / name).exists()
+
+    @pytest.mark.parametrize("name", ["results.html", "pages/page.htm"])
+    def test_nothing_is_written_into_the_folder_of_a_sweep(self, folder, name):
+        answer = self.report(folder, folder / name, "--force")
+        assert answer.exit_code == 2
+        assert "among the sweep's own" in answer.stderr
+        assert (folder / "results.csv").read_text() == "the sweep's own"
+        assert not (folder / name).exists()
+
+    @pytest.mark.parametrize("name", ["page.HTM", "page.csv"])
+    def test_files_that_are_there_are_overwritten_by_force_alone(self, folder, tmp_path, name):
+        (tmp_path / name).write_text("mine")
+        answer = self.report(folder, tmp_path / "page.HTM")
+        assert answer.exit_code == 2
+        assert f"{name} exists; another name, or --force" in answer.stderr
+        assert (tmp_path / name).read_text() == "mine"
+        assert self.report(folder, tmp_path / "page.HTM", "--force").exit_code == 0
+        assert (tmp_path / name).read_text() != "mine"
 
 
 class TestSweep:
@@ -190,16 +270,69 @@ class TestSweep:
         assert call(*words).exit_code == 0
         assert (folder / "results.jsonl").read_bytes() == before
 
+    def test_other_settings_are_refused_and_named(self, swept):
+        folder, words, _ = swept
+        before = (folder / "results.jsonl").read_bytes()
+        for more, difference in (
+            (("--steps", 9), "steps: 8 there, 9 asked"),
+            (("--limit", 1), "limit: all there, 1 asked"),
+            (("--patience", 0), "patience: 5 there, 0 asked"),
+        ):
+            answer = call(*words, *more)
+            assert answer.exit_code == 2
+            assert f"other settings ({difference})" in answer.stderr
+        assert (folder / "results.jsonl").read_bytes() == before
+
     @pytest.mark.parametrize("samples", [3, 0])
     def test_an_exported_model_is_a_cell_of_its_own(self, swept, masks, tmp_path, samples):
+        """The row tells how many shapes the model was trained on, of however many the cohort has now."""
         folder, _, _ = swept
         (bundle,) = (folder / "cells").glob("*-flow-ard-*/bundle")
-        words = ("sweep", "--masks", masks, "--bundle", bundle, "--samples", samples, "--limit", 1, "--jobs", 1)
+        more = shutil.copytree(masks, tmp_path / "more")
+        nib.save(nib.Nifti1Image(ellipsoid(8).astype(np.uint8), np.eye(4)), more / "train" / "e8.nii.gz")
+        words = ("sweep", "--masks", more, "--bundle", bundle, "--samples", samples, "--limit", 1, "--jobs", 1)
         answer = call(*words, "--output", tmp_path / "out")
         assert answer.exit_code == 0, answer.output
         (one,) = read_results(tmp_path / "out")
         assert (one.prior, one.regime, len(one.measured["thin"])) == ("flow-ard", "thin", 1)
         assert len(one.latent) <= samples
+        assert (one.shapes, len(open_cohort(CohortSource(masks=more), CohortOptions()).train)) == (5, 6)
+
+    def test_an_exported_model_is_not_measured_on_shapes_of_its_training(self, swept, masks, tmp_path):
+        folder, _, _ = swept
+        (bundle,) = (folder / "cells").glob("*-flow-ard-*/bundle")
+        trained = open_cohort(CohortSource(masks=masks), CohortOptions()).train[0].name
+        other = shutil.copytree(masks, tmp_path / "other")
+        (other / "train" / f"{trained}.nii.gz").rename(other / "test" / f"a-{trained}.nii.gz")
+        words = ("sweep", "--masks", other, "--bundle", bundle, "--samples", 0, "--limit", 1, "--jobs", 1)
+        answer = call(*words, "--output", tmp_path / "out")
+        assert answer.exit_code == 2
+        assert f"trained on a-{trained}, which is to be among the test cases" in answer.stderr
+        assert not (tmp_path / "out" / "results.jsonl").exists()
+
+    def test_two_models_of_one_cell_are_refused(self, swept, masks, tmp_path):
+        folder, _, _ = swept
+        (bundle,) = (folder / "cells").glob("*-flow-ard-*/bundle")
+        other = shutil.copytree(bundle, tmp_path / "other")
+        words = ("sweep", "--masks", masks, "--bundle", bundle, "--bundle", other, "--output", tmp_path / "out")
+        answer = call(*words)
+        assert answer.exit_code == 2
+        assert f"Two bundles belong to the cell {bundle.parent.name}" in answer.stderr
+        assert not (tmp_path / "out").exists()
+
+    def test_another_model_than_the_one_of_the_cell_is_refused(self, swept, masks, tmp_path):
+        folder, _, _ = swept
+        (bundle,) = (folder / "cells").glob("*-flow-ard-*/bundle")
+        other = shutil.copytree(bundle, tmp_path / "other")
+        write_manifest(replace(read_manifest(bundle)[0], likelihood_precision=0.37), other)
+        place = Place(tmp_path / "run", tmp_path / "out" / "cells" / bundle.parent.name / "bundle", bundle)
+        for _ in range(2):
+            adopt(bundle, place)
+        assert [path.name for path in place.bundle.parent.iterdir()] == ["bundle"]
+        answer = call("sweep", "--masks", masks, "--bundle", other, "--output", tmp_path / "out")
+        assert answer.exit_code == 2
+        assert f"another bundle as the cell {bundle.parent.name}" in answer.stderr
+        assert read_manifest(place.bundle)[0] == read_manifest(bundle)[0]
 
     def test_plain_cells_keep_their_prior_and_the_others_are_pruned(self, swept):
         folder, _, _ = swept
@@ -209,18 +342,6 @@ class TestSweep:
         }
         assert pruned == {"plain": False, "flow-ard": True}
         assert len(list((folder / "trainings").glob("*/run/checkpoint.pt"))) == 1
-
-    @pytest.mark.parametrize("prior", ["flow", "ard"])
-    def test_other_parts_of_the_prior_use_the_training_that_is_there(self, swept, tmp_path, prior):
-        folder, words, _ = swept
-        shutil.copytree(folder / "trainings", tmp_path / "trainings")
-        shutil.copy(folder / "sweep.json", tmp_path)
-        (checkpoint,) = tmp_path.glob("trainings/*/run/checkpoint.pt")
-        before = checkpoint.stat().st_mtime_ns
-        answer = call(*words[:-4], tmp_path, "--prior", prior, "--jobs", 1)
-        assert answer.exit_code == 0, answer.output
-        (one,) = read_results(tmp_path)
-        assert (one.prior, checkpoint.stat().st_mtime_ns) == (prior, before)
 
     def test_a_prior_is_chosen_at_the_precision_that_the_cell_is_measured_with(self, swept, masks):
         folder, _, _ = swept
@@ -234,25 +355,46 @@ class TestSweep:
         assert manifest.likelihood_precision == 0.1
         assert manifest.training["pruned"]["fitted"] == asdict(choice.parts)
 
-    def test_cells_of_a_training_trust_drawings_as_its_plain_one_does(self, swept, tmp_path):
+    def test_other_priors_use_the_training_that_is_there_and_trust_drawings_as_its_plain_cell(self, swept, tmp_path):
         folder, words, _ = swept
-        shutil.copytree(folder, tmp_path / "again")
-        (fitted,) = (tmp_path / "again" / "cells").glob("*-flow-ard-*")
-        (plain,) = (tmp_path / "again" / "cells").glob("*-plain-*/bundle")
-        shutil.rmtree(fitted)
-        kept = [one for one in read_results(folder) if one.prior == "plain"]
-        (tmp_path / "again" / "results.jsonl").unlink()
-        append(tmp_path / "again", *kept)
+        again = shutil.copytree(folder, tmp_path / "again")
+        for path in (again / "sweep.json", again / "results.jsonl", *again.glob("cells/*-flow-ard-*/bundle")):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        append(again, *[one for one in read_results(folder) if one.prior == "plain"])
+        (plain,) = again.glob("cells/*-plain-*/bundle")
         known = {"spread_mm": 0.77, "fidelity": 0.42}
         facts = {"cohort": "made here"}
         changed = replace(read_manifest(plain)[0], likelihood_precision=0.37, discrepancy=known, calibration=facts)
         write_manifest(changed, plain)
-        answer = call(*[word for word in words[:-4] if word != "--no-calibrate"], tmp_path / "again", "--jobs", 1)
+        (checkpoint,) = again.glob("trainings/*/run/checkpoint.pt")
+        before = checkpoint.stat().st_mtime_ns
+        calibrated = [word for word in words[:-4] if word != "--no-calibrate"]
+        answer = call(*calibrated, again, "--prior", "plain", "--prior", "flow", "--prior", "ard", "--jobs", 1)
         assert answer.exit_code == 0, answer.output
-        found = read_manifest(fitted / "bundle")[0]
-        assert (found.likelihood_precision, found.discrepancy) == (0.37, known)
-        assert found.calibration == {**facts, "sound_drawings": 5, "sound_cases": 1}
-        assert found.usual
+        assert checkpoint.stat().st_mtime_ns == before
+        assert [one.prior for one in read_results(again)] == ["plain", "flow", "ard"]
+        for prior in ("flow", "ard"):
+            (bundle,) = again.glob(f"cells/*-{prior}-*/bundle")
+            found = read_manifest(bundle)[0]
+            assert (found.training["pruned"]["fitted"]["flow"], found.training["pruned"]["fitted"]["ard"]) == (
+                prior == "flow",
+                prior == "ard",
+            )
+            assert (found.likelihood_precision, found.discrepancy) == (0.37, known)
+            assert found.calibration == {**facts, "sound_drawings": 5, "sound_cases": 1}
+            assert found.usual
+
+    def test_trust_taken_over_takes_out_what_was_measured_before(self, swept, masks, tmp_path):
+        folder, _, _ = swept
+        (bundle,) = (folder / "cells").glob("*-flow-ard-*/bundle")
+        other = shutil.copytree(bundle, tmp_path / "other")
+        manifest = read_manifest(bundle)[0]
+        write_manifest(replace(manifest, accuracy={"test/thin": {"dice": 0.9}}), other)
+        known = replace(manifest, likelihood_precision=0.37, discrepancy={"spread_mm": 0.77, "fidelity": 0.42})
+        calibrate_bundle_as(other, known, open_cohort(CohortSource(masks=masks), CohortOptions()))
+        found = read_manifest(other)[0]
+        assert (found.likelihood_precision, found.discrepancy) == (0.37, known.discrepancy)
+        assert found.accuracy == {}
 
     def test_the_report_is_one_file_with_tables_and_panels(self, swept, tmp_path):
         folder, _, _ = swept
@@ -271,10 +413,43 @@ class TestSweep:
         text = (tmp_path / "page.html").read_text(encoding="utf-8")
         assert text.count("not to be passed on") == 3
 
+    def test_panels_show_the_test_shapes_of_the_seed_of_their_cells(self, swept, masks, tmp_path):
+        """Without a test split the seed says which shapes are held out."""
+        folder, _, _ = swept
+        source, options = CohortSource(masks=masks / "train"), CohortOptions(test_fraction=0.4)
+        held = {at: [one.name for one in open_cohort(source, replace(options, seed=at)).test] for at in range(9)}
+        seed = next(at for at, names in held.items() if set(names).isdisjoint(held[0]))
+        write_record(tmp_path / "sweep", source, options, EFFORT.settings())
+        for one, at in ((one, at) for one in read_results(folder) for at in (seed, seed + 1)):
+            key = f"{one.key.rpartition('-')[0]}-s{at}"
+            measured = (
+                {name: dict.fromkeys(FIGURES, 0.1 * n) for n, name in enumerate(held[seed])} if at == seed else {}
+            )
+            append(tmp_path / "sweep", replace(one, key=key, seed=at, measured={"thin": measured}))
+            shutil.copytree(folder / "cells" / one.key, tmp_path / "sweep" / "cells" / key)
+        assert pictured_seed(read_results(tmp_path / "sweep")) == seed
+        answer = call("report", tmp_path / "sweep", "--output", tmp_path / "page.html")
+        assert answer.exit_code == 0, answer.output
+        text = (tmp_path / "page.html").read_text(encoding="utf-8")
+        assert "not there any more" not in text
+        assert all(re.search(rf"<h3>{letter}\. [^<]*</h3><figure>", text) for letter in "AD")
+
     def test_a_cohort_without_test_shapes_is_refused(self, masks, tmp_path):
         answer = call("sweep", "--masks", masks / "train", *QUICK, "--output", tmp_path / "out")
         assert answer.exit_code == 2
         assert "--test-fraction" in answer.stderr
+
+    def test_patience_without_validation_shapes_is_refused_where_it_is_asked_for(self, masks, tmp_path):
+        """All shapes are one person's, of whom none can be held out."""
+        other = shutil.copytree(masks, tmp_path / "masks")
+        lines = [f"e{n},one,train" for n in range(6)] + [f"e{n},other,test" for n in (6, 7)]
+        (other / "cases.csv").write_text("\n".join(["case,person,split", *lines]))
+        assert not open_cohort(CohortSource(masks=other), CohortOptions()).validation
+        words = ("sweep", "--masks", other, *QUICK, "--output", tmp_path / "out", "--patience", 1)
+        answer = call(*words)
+        assert answer.exit_code == 2
+        assert "no validation cases by which a training could end early" in answer.stderr
+        assert not (tmp_path / "out").exists()
 
 
 def test_a_killed_sweep_goes_on_from_its_checkpoint(masks, tmp_path, repository):

@@ -19,7 +19,9 @@ def cohort(side):
     return Cohort("e", (CASE,), (), (), (), Provenance("made here", "CC0", "nobody", shippable=True), side)
 
 
-@pytest.mark.parametrize(("side", "reflected"), [("mixed", True), ("unpaired", True), ("left", False)])
+@pytest.mark.parametrize(
+    ("side", "reflected"), [("mixed", True), ("unpaired", True), ("left", False), ("not stated", False)]
+)
 def test_mirror_images_are_learnt_from_where_both_sides_come(side, reflected):
     config = completion_config(cohort(side), WINDOWS, reflect=None, steps=None, seed=3)
     assert config.reflected is reflected
