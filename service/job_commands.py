@@ -19,12 +19,12 @@ from service import use_cases
 from service.commands import ExtentsOption, FidelityOption, ForceOption, JsonOption, ModelOption, RejectOption
 from service.console import bar, echo_json, require_free, writing
 from service.errors import NotReady
+from service.job_archives import zip_of_folder
 from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobState, JobStatus
 from service.job_presentation import job_summary
 from service.job_results import write_zip
-from service.job_submission import JobDesk, require_first_stack
-from service.jobs.reconstructions import zip_of_folder
+from service.job_submission import JobDesk, require_archive
 from service.jobs.worker import supervised_workers
 from service.model_registry import pinned_name
 from service.observability import make_log
@@ -121,7 +121,7 @@ def reconstruct_job(
         "extents": extents,
     }
     archive = _archive(masks)
-    require_first_stack(parse_annotated(annotated), archive)
+    require_archive(archive, parse_annotated(annotated), settings.archive_limits)
     _begin(settings, RECONSTRUCTIONS_JOB, argument, archive, key, output, as_json=as_json)
 
 

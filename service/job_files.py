@@ -1,11 +1,28 @@
 """Where the files of a job lie in a `BlobStore`: its inputs, and its items, each complete or not there."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from service.errors import UnknownResult
 from service.job_ports import BlobStore, Record
+from service.ports import ResultStore
+
+_ROOT = "jobs"
+
+
+def jobs_with_files(blobs: BlobStore) -> Iterable[str]:
+    """Identifiers of the jobs that have any."""
+    return blobs.folders(f"{_ROOT}/")
+
+
+def remove_job(blobs: BlobStore, results: ResultStore, job: str) -> None:
+    """Forget the files of a job, and the result of a single reconstruction, which has the job's identifier."""
+    JobFiles(blobs, job).remove()
+    with suppress(UnknownResult):
+        results.delete(job)
 
 
 class JobFiles:
@@ -16,19 +33,27 @@ class JobFiles:
 
     def __init__(self, blobs: BlobStore, job: str) -> None:
         self._blobs = blobs
-        self._root = f"jobs/{job}"
+        self._root = f"{_ROOT}/{job}"
 
-    def put_input(self, number: int, content: bytes | Path) -> None:
-        """Keep what the caller sent."""
-        key = self._key("inputs", number)
+    def put_input(self, number: int, content: bytes | Path, submission: str = "") -> None:
+        """Keep what the caller sent.
+
+        Args:
+            submission: name of this attempt where several may want to make the same job; each keeps its own.
+        """
+        key = self._input(number, submission)
         if isinstance(content, Path):
             self._blobs.put_file(key, content)
         else:
             self._blobs.put(key, content)
 
-    def input(self, number: int) -> bytes:
+    def input(self, number: int, submission: str = "") -> bytes:
         """What the caller sent."""
-        return self._blobs.get(self._key("inputs", number))
+        return self._blobs.get(self._input(number, submission))
+
+    def remove_inputs(self, submission: str = "") -> None:
+        """Forget what one attempt has kept."""
+        self._blobs.delete(f"{self._inputs(submission)}/")
 
     def put_item(self, number: int, files: Mapping[str, bytes], entry: Record) -> None:
         """Keep an item; the names of its files are for the reader, the entry's member `files` lists them."""
@@ -58,6 +83,12 @@ class JobFiles:
     def remove(self) -> None:
         """Forget all of it."""
         self._blobs.delete(f"{self._root}/")
+
+    def _input(self, number: int, submission: str) -> str:
+        return f"{self._inputs(submission)}/{number:08d}"
+
+    def _inputs(self, submission: str) -> str:
+        return f"{self._root}/inputs/{submission}".rstrip("/")
 
     def _key(self, folder: str, number: int) -> str:
         return f"{self._root}/{folder}/{number:08d}"

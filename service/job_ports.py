@@ -1,6 +1,6 @@
 """Work that survives a restart: what a kind of job is, what a running one may do, who keeps them and their files."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
@@ -111,11 +111,13 @@ class JobKind:
             `JobRun` remembered, so it must do the same each time: no clock, no randomness, no files but in steps.
         parts: the work itself. Idempotent: the same item leads to the same files and the same answer. Its check raises
             `Cancelled` once nobody wants the job any more; call it between items, or give it to what takes long.
+        forget: removes what parts of a job have made; called when one ends after its job was deleted.
     """
 
     name: str
     follow: Callable[[JobRun, Record], Record]
     parts: Mapping[str, Callable[[Record, Check], Record]]
+    forget: Callable[[str], None] = lambda _: None
 
 
 class JobEngine(Protocol):
@@ -139,6 +141,10 @@ class JobEngine(Protocol):
 
     def forget(self, identifier: str) -> None:
         """Remove the record of a job that has ended; nothing when it is not there."""
+        ...
+
+    def known(self, identifiers: Collection[str]) -> set[str]:
+        """Those of the identifiers that a job has."""
         ...
 
     def ended_before(self, moment: datetime) -> Iterator[str]:
@@ -179,6 +185,10 @@ class BlobStore(Protocol):
 
     def list(self, prefix: str) -> Iterable[str]:
         """Keys below a folder (``a/b/``), in no order."""
+        ...
+
+    def folders(self, prefix: str) -> Iterable[str]:
+        """Names of the folders in a folder (``a/``), in no order."""
         ...
 
     def delete(self, prefix: str) -> None:

@@ -1,11 +1,9 @@
 """How something asked for becomes a job: once for each key, within a bound on their number, its inputs kept first."""
 
 import hashlib
-import io
 import json
-import zipfile
+import uuid
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,11 +11,15 @@ from model.errors import InvalidParameter
 from model.inference.annotated_planes import check_stacks
 from model.inference.observations import AnnotatedRule, Plane
 from service.errors import Overloaded, StoreFull, UnknownJob
+from service.job_archives import ArchiveLimits, masks_of, open_archive
 from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobStatus
 
 #: Member of a job's argument: SHA-256 of everything that was asked for.
 _FINGERPRINT = "fingerprint"
+#: Member of a job's argument: whose inputs are the job's. Empty where no other request can want the same job, and not
+#: there in records of earlier releases.
+SUBMISSION = "submission"
 
 
 @dataclass(frozen=True)
@@ -46,15 +48,15 @@ class JobDesk:
         identifier = self.jobs.new_id(kind, key)
         found = self._found(identifier) if key is not None else None
         if found is not None:
-            if found.argument.get(_FINGERPRINT) != fingerprint:
-                raise InvalidParameter(
-                    "This key was sent with another request; send a new one.", part="Idempotency-Key"
-                )
-            return found
+            return _of_same_request(found, fingerprint)
         if self.jobs.unfinished() >= self.max_jobs:
             raise Overloaded("As many jobs wait as this service accepts; send the request again later.")
-        self._keep(identifier, inputs)
-        return self.jobs.enqueue(kind, {**argument, _FINGERPRINT: fingerprint}, identifier)
+        submission = "" if key is None else uuid.uuid4().hex
+        self._keep(identifier, inputs, submission)
+        made = self.jobs.enqueue(kind, {**argument, _FINGERPRINT: fingerprint, SUBMISSION: submission}, identifier)
+        if made.argument.get(SUBMISSION, "") != submission:  # another request of the same key was faster
+            JobFiles(self.blobs, identifier).remove_inputs(submission)
+        return _of_same_request(made, fingerprint)
 
     def _found(self, identifier: str) -> JobStatus | None:
         try:
@@ -62,13 +64,13 @@ class JobDesk:
         except UnknownJob:
             return None
 
-    def _keep(self, identifier: str, inputs: Sequence[bytes]) -> None:
+    def _keep(self, identifier: str, inputs: Sequence[bytes], submission: str) -> None:
         files = JobFiles(self.blobs, identifier)
         try:
             for number, data in enumerate(inputs):
-                files.put_input(number, data)
+                files.put_input(number, data, submission)
         except OSError as fault:
-            files.remove()
+            files.remove_inputs(submission)
             raise StoreFull("What was sent cannot be kept now; send the request again later.") from fault
 
 
@@ -78,12 +80,24 @@ def require_stacks(annotated: AnnotatedRule | Sequence[Plane], count: int) -> No
         check_stacks(annotated, count)
 
 
-def require_first_stack(annotated: AnnotatedRule | Sequence[Plane], archive: bytes) -> None:
-    """Refuse planes of other stacks than the first of each mask of an archive; DICOM objects may have several."""
-    with suppress(zipfile.BadZipFile), zipfile.ZipFile(io.BytesIO(archive)) as opened:
-        if any(name.lower().endswith(".dcm") for name in opened.namelist()):
-            return
-    require_stacks(annotated, 1)
+def require_archive(archive: bytes, annotated: AnnotatedRule | Sequence[Plane], limits: ArchiveLimits) -> None:
+    """Refuse an archive that cannot be unpacked, before a job is made of it.
+
+    Raises:
+        InvalidParameter: no ZIP, or planes of other stacks than the first of each mask; DICOM objects may have several.
+        TooLarge: more masks than a job may have, or larger ones.
+    """
+    with open_archive(archive) as opened:
+        names = [info.filename.lower() for info in masks_of(opened, limits)]
+    if not any(name.endswith(".dcm") for name in names):
+        require_stacks(annotated, 1)
+
+
+def _of_same_request(found: JobStatus, fingerprint: str) -> JobStatus:
+    """The job, if it was made for the request of this fingerprint."""
+    if found.argument.get(_FINGERPRINT) != fingerprint:
+        raise InvalidParameter("This key was sent with another request; send a new one.", part="Idempotency-Key")
+    return found
 
 
 def _fingerprint(argument: Mapping[str, Any], inputs: Sequence[bytes]) -> str:

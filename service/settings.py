@@ -19,6 +19,7 @@ from pydantic_settings import (
 )
 
 from model.errors import InvalidParameter
+from service.job_archives import ArchiveLimits
 
 #: Names a TOML file with settings; the environment overrides it.
 SETTINGS_FILE_VARIABLE = "MORPHOFLOW_SETTINGS_FILE"
@@ -71,6 +72,7 @@ class Settings(BaseSettings):
     max_jobs: int = Field(64, ge=0, description="jobs that may wait or run")
     max_job_samples: int = Field(100_000, ge=1, description="most shapes of a job")
     max_job_masks: int = Field(10_000, ge=1, description="most masks of a job")
+    max_job_bytes: int = Field(4 * 2**30, ge=1, description="masks of a job together, unpacked")
     pacs_file: Path | None = Field(
         None, description="TOML file that says how the service stands among picture archives; no DICOM when left out"
     )
@@ -100,6 +102,11 @@ class Settings(BaseSettings):
         file = os.environ.get(SETTINGS_FILE_VARIABLE)
         toml = (TomlConfigSettingsSource(settings_cls, Path(file)),) if file else ()
         return (init_settings, env_settings, *toml)
+
+    @property
+    def archive_limits(self) -> ArchiveLimits:
+        """What the archive of a job may hold."""
+        return ArchiveLimits(self.max_job_masks, self.max_body_bytes, self.max_job_bytes)
 
     @property
     def keys(self) -> tuple[str, ...]:

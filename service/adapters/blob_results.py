@@ -1,15 +1,15 @@
 """Results in a `BlobStore`, for several machines over one storage: the files of `archive`, and a marker of expiry."""
 
+import json
 import tempfile
 import time
 import uuid
 import zipfile
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 
 from service.adapters.archive import MESH, STATE, SUMMARY, read_document, read_outcome, write_outcome
-from service.errors import UnknownResult
+from service.adapters.result_store import moment, unknown_result
 from service.job_ports import BlobStore
 from service.ports import Outcome, StoredResult
 
@@ -36,7 +36,7 @@ class BlobResultStore:
             self._blobs.put(f"expiry/{int(times['expires']):012d}/{name}", b"")
             for file in (STATE, MESH, SUMMARY):
                 self._blobs.put_file(f"results/{name}/{file}", Path(folder) / file)
-        return StoredResult(name, _moment(now), _moment(times["expires"]), outcome)
+        return StoredResult(name, moment(now), moment(times["expires"]), outcome)
 
     def load(self, identifier: str) -> StoredResult:
         """A result that has not expired; `UnknownResult` otherwise."""
@@ -47,39 +47,42 @@ class BlobResultStore:
                     (Path(folder) / file).write_bytes(self._blobs.get(f"results/{name}/{file}"))
                 document = read_document(Path(folder))
                 if document["expires"] <= self._clock():
-                    raise _unknown()
+                    raise unknown_result()
                 outcome = read_outcome(Path(folder), document)
             except (FileNotFoundError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
-                raise _unknown() from None
-        return StoredResult(name, _moment(document["created"]), _moment(document["expires"]), outcome)
+                raise unknown_result() from None
+        return StoredResult(name, moment(document["created"]), moment(document["expires"]), outcome)
 
     def delete(self, identifier: str) -> None:
         """Forget a result; `UnknownResult` when it is not there or has expired."""
-        self.load(identifier)
-        self._blobs.delete(f"results/{identifier}/")
+        self._blobs.delete(f"results/{self.load(identifier).id}/")
 
     def sweep(self) -> int:
         """Remove expired results; how many."""
-        count = 0
+        due: dict[str, list[str]] = {}
         for key in list(self._blobs.list("expiry/")):
-            _, moment, name = key.split("/")
-            if float(moment) <= self._clock():
+            _, time_s, name = key.split("/")
+            if float(time_s) <= self._clock():
+                due.setdefault(time_s, []).append(name)
+        count = 0
+        for time_s, names in due.items():
+            gone = [name for name in names if self._expiry(name) <= self._clock()]
+            for name in gone:
                 self._blobs.delete(f"results/{name}/")
-                self._blobs.delete(f"expiry/{moment}/")
-                count += 1
+            self._blobs.delete(f"expiry/{time_s}/")
+            count += len(gone)
         return count
+
+    def _expiry(self, name: str) -> float:
+        """Until when a result is served; one that was saved again has a later marker as well."""
+        try:
+            return float(json.loads(self._blobs.get(f"results/{name}/{SUMMARY}"))["expires"])
+        except (FileNotFoundError, ValueError, KeyError, TypeError):
+            return float("-inf")
 
 
 def _checked(identifier: str) -> str:
     try:
         return str(uuid.UUID(identifier))
     except ValueError:
-        raise _unknown() from None
-
-
-def _unknown() -> UnknownResult:
-    return UnknownResult("There is no reconstruction of this identifier; it may have expired or been deleted.")
-
-
-def _moment(seconds: float) -> datetime:
-    return datetime.fromtimestamp(seconds, UTC)
+        raise unknown_result() from None

@@ -40,6 +40,14 @@ class FolderBlobs:
                 if not name.startswith(_TEMPORARY):
                     yield (Path(folder) / name).relative_to(self._folder).as_posix()
 
+    def folders(self, prefix: str) -> Iterable[str]:
+        """Names of the folders in a folder."""
+        try:
+            with os.scandir(self._path(prefix)) as entries:
+                return [entry.name for entry in entries if entry.is_dir()]
+        except FileNotFoundError:
+            return []
+
     def delete(self, prefix: str) -> None:
         """Remove everything below a folder."""
         shutil.rmtree(self._path(prefix), ignore_errors=True)

@@ -48,10 +48,10 @@ class ImageLimits:
 
 @dataclass(frozen=True)
 class Volume:
-    """Voxel values as stored and where they lie.
+    """Voxel values and where they lie.
 
     Attributes:
-        values: any number of axes, first index fastest in the file.
+        values: any number of axes.
         affine: (4, 4) from voxel index to world RAS mm, as the header says it, unchecked.
     """
 
@@ -112,8 +112,8 @@ def checked_dimensions(shape: tuple[int, ...], part: str) -> None:
         raise InvalidMask(f"{part} has {len(shape)} dimensions; a 3-D mask is accepted", part=part)
 
 
-def inflated(file: BinaryIO, encoding: str, size: int, part: str) -> memoryview:
-    """Exactly the claimed number of bytes, from the file's position on, decompressed.
+def inflated(file: BinaryIO, encoding: str, size: int, part: str) -> Iterator[bytes]:
+    """Exactly the claimed number of bytes, from the file's position on, decompressed, some at a time.
 
     Args:
         encoding: ``raw``, ``gzip``, ``zlib`` or ``bzip2``.
@@ -123,19 +123,21 @@ def inflated(file: BinaryIO, encoding: str, size: int, part: str) -> memoryview:
         UnreadableImage: fewer bytes than claimed, or a damaged stream.
         TooLarge: more than `TRAILING_LIMIT` bytes beyond the claim, as a decompression bomb has.
     """
+    read = 0
     try:
-        data = _read_at_most(_decompressor(file, encoding), size + TRAILING_LIMIT + 1)
+        for piece in _read_at_most(_decompressor(file, encoding), size + TRAILING_LIMIT + 1):
+            yield piece[: max(0, size - read)]
+            read += len(piece)
     except (OSError, EOFError, zlib.error) as error:
         raise UnreadableImage(
             f"{part} is damaged or ends too early; a complete image is accepted", part=part
         ) from error
-    if len(data) < size:
+    if read < size:
         raise UnreadableImage(f"{part} ends before its last voxel; a complete image is accepted", part=part)
-    if len(data) > size + TRAILING_LIMIT:
+    if read > size + TRAILING_LIMIT:
         raise TooLarge(
             f"{part} holds more data than its header claims; only the claimed voxels are accepted", part=part
         )
-    return memoryview(data)[:size]
 
 
 def _decompressor(file: BinaryIO, encoding: str) -> Any:
@@ -148,11 +150,11 @@ def _decompressor(file: BinaryIO, encoding: str) -> Any:
     return file
 
 
-def _read_at_most(stream: Any, limit: int) -> bytearray:
-    data = bytearray()
-    while len(data) < limit and (chunk := stream.read(min(CHUNK, limit - len(data)))):
-        data += chunk
-    return data
+def _read_at_most(stream: Any, limit: int) -> Iterator[bytes]:
+    left = limit
+    while left > 0 and (piece := stream.read(min(CHUNK, left))):
+        left -= len(piece)
+        yield piece
 
 
 class _ZlibReader:
@@ -176,8 +178,3 @@ class _ZlibReader:
             if data:
                 return data
         return b""
-
-
-def decoded(data: memoryview, kind: np.dtype[Any], shape: tuple[int, ...]) -> Shaped[np.ndarray, "..."]:
-    """Raw voxels as an array, first index fastest; a view of the bytes."""
-    return np.frombuffer(data, dtype=kind).reshape(shape, order="F")

@@ -18,9 +18,8 @@ from service.adapters.image_guard import (
     Volume,
     checked_dimensions,
     checked_shape,
-    decoded,
-    inflated,
 )
+from service.adapters.voxels import Stored, read_voxels
 
 VOXEL_TYPES = {
     "MET_CHAR": "i1",
@@ -73,9 +72,8 @@ def read_metaimage(file: BinaryIO, part: str, limits: ImageLimits) -> Volume:
     if fields.get("ElementType") not in VOXEL_TYPES or not _is_true(fields, "BinaryData", "True"):
         raise UnreadableImage(f"{part} has voxels of an unknown type; binary numbers are accepted", part=part)
     kind = np.dtype(order + VOXEL_TYPES[fields["ElementType"]])
-    size = int(np.prod(shape, dtype=object)) * kind.itemsize
     encoding = "zlib" if _is_true(fields, "CompressedData") else "raw"
-    return Volume(decoded(inflated(file, encoding, size, part), kind, shape), affine)
+    return Volume(read_voxels(file, Stored(encoding, kind, shape), part, limits), affine)
 
 
 def _header(file: BinaryIO, part: str) -> dict[str, str]:

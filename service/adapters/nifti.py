@@ -23,9 +23,8 @@ from service.adapters.image_guard import (
     Volume,
     checked_dimensions,
     checked_shape,
-    decoded,
-    inflated,
 )
+from service.adapters.voxels import Scaling, Stored, read_voxels
 
 #: Bytes from which a NIfTI header can be told and read.
 HEAD_SIZE = 540
@@ -69,12 +68,12 @@ def read_nifti(file: BinaryIO, part: str, limits: ImageLimits) -> Volume:
     kind = _voxel_type(header, part)
     affine = _affine(header, part)
     start = _voxel_start(header, part)
-    size = start + int(np.prod(shape, dtype=object)) * kind.itemsize
+    scaled = _scaling(header, part)
     file.seek(0)
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
-    data = inflated(file, "gzip" if zipped else "raw", size, part)
-    return Volume(_scaled(decoded(data[start:], kind, shape), header, part), affine)
+    stored = Stored("gzip" if zipped else "raw", kind, shape, start, scaled)
+    return Volume(read_voxels(file, stored, part, limits), affine)
 
 
 def _parsed(head: bytes, part: str) -> Any:
@@ -143,15 +142,19 @@ def _affine(header: Any, part: str) -> Float[np.ndarray, "4 4"]:
     return affine
 
 
-def _scaled(values: Shaped[np.ndarray, "..."], header: Any, part: str) -> Shaped[np.ndarray, "..."]:
+def _scaling(header: Any, part: str) -> Scaling | None:
     try:
         slope, intercept = header.get_slope_inter()
     except HeaderDataError as error:
         raise _damaged(part) from error
-    if slope is None:
-        return values
-    with np.errstate(all="ignore"):
-        return np.asarray(apply_read_scaling(values, slope, intercept))
+    if slope is None or (slope, intercept) == (1.0, 0.0):
+        return None
+
+    def scaled(values: Shaped[np.ndarray, "n"]) -> Shaped[np.ndarray, "n"]:
+        with np.errstate(all="ignore"):
+            return np.asarray(apply_read_scaling(values, slope, intercept))
+
+    return scaled
 
 
 def write_nifti(

@@ -22,9 +22,8 @@ from service.adapters.image_guard import (
     Volume,
     checked_dimensions,
     checked_shape,
-    decoded,
-    inflated,
 )
+from service.adapters.voxels import Stored, read_voxels
 
 MAGIC = b"NRRD00"
 ENCODINGS = {"raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2"}
@@ -88,8 +87,8 @@ def read_nrrd(file: BinaryIO, part: str, limits: ImageLimits, *, labels_named: b
             part=part,
         )
     affine = _affine(fields, part, first_axis=int(layered))
-    values = _values(file, fields, shape, part)
-    return Volume(values.max(axis=0) if layered else values, affine)
+    values = _values(file, fields, shape, part, limits)
+    return Volume(values.max(axis=0) if layered and values.shape == shape else values, affine)
 
 
 def _header(file: BinaryIO, part: str) -> dict[str, Any]:
@@ -118,14 +117,15 @@ def _has_layers(fields: dict[str, Any], shape: tuple[int, ...]) -> bool:
     return len(shape) == 4 and len(kinds) == 4 and kinds[0] in LAYER_KINDS
 
 
-def _values(file: BinaryIO, fields: dict[str, Any], shape: tuple[int, ...], part: str) -> Shaped[np.ndarray, "..."]:
+def _values(
+    file: BinaryIO, fields: dict[str, Any], shape: tuple[int, ...], part: str, limits: ImageLimits
+) -> Shaped[np.ndarray, "..."]:
     kind = _voxel_type(fields, part)
     encoding = ENCODINGS.get(str(fields.get("encoding")).lower())
     skips = [fields.get(key, 0) for key in ("line skip", "lineskip", "byte skip", "byteskip")]
     if encoding is None or any(skips):
         raise UnreadableImage(f"{part} has an unknown NRRD encoding; raw, gzip and bzip2 are accepted", part=part)
-    size = int(np.prod(shape, dtype=object)) * kind.itemsize
-    return decoded(inflated(file, encoding, size, part), kind, shape)
+    return read_voxels(file, Stored(encoding, kind, shape), part, limits)
 
 
 def _voxel_type(fields: dict[str, Any], part: str) -> np.dtype[Any]:

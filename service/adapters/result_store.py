@@ -80,7 +80,7 @@ class DiskResultStore:
             if isinstance(fault, OSError) and fault.errno in _NO_ROOM:
                 raise StoreFull("The disk has no room for the result; send the request again later.") from fault
             raise
-        return StoredResult(identifier, _moment(now), _moment(times["expires"]), outcome)
+        return StoredResult(identifier, moment(now), moment(times["expires"]), outcome)
 
     def load(self, identifier: str) -> StoredResult:
         """A result that has not expired; `UnknownResult` otherwise."""
@@ -88,11 +88,11 @@ class DiskResultStore:
         try:
             document = read_document(folder)
             if document["expires"] <= self._clock():
-                raise _unknown()
+                raise unknown_result()
             outcome = read_outcome(folder, document)
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
-            raise _unknown() from None
-        return StoredResult(identifier, _moment(document["created"]), _moment(document["expires"]), outcome)
+            raise unknown_result() from None
+        return StoredResult(identifier, moment(document["created"]), moment(document["expires"]), outcome)
 
     def delete(self, identifier: str) -> None:
         """Forget a result; `UnknownResult` when it is not there or has expired."""
@@ -100,7 +100,7 @@ class DiskResultStore:
         with self._lock:
             expired = self._expiry(folder) <= self._clock()
             if not self._remove(identifier) or expired:
-                raise _unknown()
+                raise unknown_result()
 
     def sweep(self) -> int:
         """Remove expired, damaged and half-written results; how many."""
@@ -114,7 +114,7 @@ class DiskResultStore:
 
     def _path(self, identifier: str) -> Path:
         if not _IDENTIFIER.match(identifier):
-            raise _unknown()
+            raise unknown_result()
         return self._folder / identifier
 
     def _results(self) -> list[str]:
@@ -152,11 +152,13 @@ class DiskResultStore:
         return True
 
 
-def _unknown() -> UnknownResult:
+def unknown_result() -> UnknownResult:
+    """What is said of a result that is not there, wherever results are kept."""
     return UnknownResult("There is no reconstruction of this identifier; it may have expired or been deleted.")
 
 
-def _moment(seconds: float) -> datetime:
+def moment(seconds: float) -> datetime:
+    """Seconds since 1970 as a time of day."""
     return datetime.fromtimestamp(seconds, UTC)
 
 

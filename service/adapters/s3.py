@@ -68,6 +68,15 @@ class S3Blobs:
                 for item in page.get("Contents", []):
                     yield item["Key"].removeprefix(self._prefix)
 
+    def folders(self, prefix: str) -> Iterable[str]:
+        """Names of the folders in a folder."""
+        place = self._prefix + prefix
+        with _as_os_errors():
+            pages = self._client.get_paginator("list_objects_v2")
+            for page in pages.paginate(Bucket=self._bucket, Prefix=place, Delimiter="/"):
+                for item in page.get("CommonPrefixes", []):
+                    yield item["Prefix"].removeprefix(place).rstrip("/")
+
     def delete(self, prefix: str) -> None:
         """Remove everything below a folder."""
         for key in list(self.list(prefix)):

@@ -17,7 +17,7 @@ _PARTS, _FEWEST, _MOST = 96, 4, 64
 
 def samples_kind(tools: JobTools) -> JobKind:
     """The kind of job: `count` shapes of `model` from `seed` on."""
-    return JobKind(SAMPLES_JOB, _follow, {"draw": lambda item, check: _draw(tools, item, check)})
+    return JobKind(SAMPLES_JOB, _follow, {"draw": lambda item, check: _draw(tools, item, check)}, tools.forget)
 
 
 def _follow(run: JobRun, argument: Record) -> Record:

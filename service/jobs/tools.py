@@ -6,7 +6,8 @@ from typing import Any
 
 from model.inference.calipers import USUAL_EXTENTS, parse_extents
 from model.inference.reconstruction import Options
-from service.job_files import JobFiles
+from service.job_archives import ArchiveLimits
+from service.job_files import JobFiles, remove_job
 from service.job_ports import BlobStore
 from service.observability import Log
 from service.ports import Catalogue, MaskReader, MeshWriter, ResultStore, VolumeWriter
@@ -19,8 +20,7 @@ class JobTools:
 
     Attributes:
         max_voxels: of any grid that is made on the way.
-        max_bytes: of one mask.
-        max_masks: of one job.
+        archive_limits: of the archive of one job.
     """
 
     registry: Catalogue
@@ -31,12 +31,15 @@ class JobTools:
     write_volume: VolumeWriter
     log: Log
     max_voxels: int
-    max_bytes: int
-    max_masks: int
+    archive_limits: ArchiveLimits
 
     def files(self, job: str) -> JobFiles:
         """The files of a job."""
         return JobFiles(self.blobs, job)
+
+    def forget(self, job: str) -> None:
+        """Remove what a job has made."""
+        remove_job(self.blobs, self.store, job)
 
 
 def options_of(record: Mapping[str, Any]) -> Options:

@@ -23,6 +23,7 @@ from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobKind
 from service.jobs.kinds import all_kinds
 from service.jobs.priority import stand_back
+from service.jobs.strays import Strays
 from service.jobs.tools import JobTools
 from service.model_registry import ModelRegistry
 from service.observability import Log, make_log
@@ -52,8 +53,7 @@ def make_tools(settings: Settings, registry: ModelRegistry, log: Log) -> JobTool
         write_volume=write_nifti,
         log=log,
         max_voxels=settings.max_voxels,
-        max_bytes=settings.max_body_bytes,
-        max_masks=settings.max_job_masks,
+        archive_limits=settings.archive_limits,
     )
 
 
@@ -68,10 +68,11 @@ def run_worker(settings: Settings, registry: ModelRegistry, slot: int, *, attach
     log = make_log(settings.log_level)
     tools = make_tools(settings, registry, log)
     jobs = open_jobs(settings)
+    strays = Strays(jobs, tools.blobs)
     with running_worker((*all_kinds(tools), *_pacs_kinds(settings, tools)), worker_options(settings, slot), log):
         log.info("worker started", slot=slot)
         while not stop.wait(settings.sweep_interval_s):
-            remove_expired(jobs, tools.blobs, settings.result_lifetime_s, log)
+            remove_expired(jobs, tools.blobs, strays, settings.result_lifetime_s, log)
             registry.refresh()
         _leave_within(_LEAVE_WITHIN_S)
     jobs.close()
@@ -101,12 +102,13 @@ def _stop_with_input(stop: threading.Event) -> None:
     stop.set()
 
 
-def remove_expired(jobs: JobEngine, blobs: BlobStore, lifetime_s: float, log: Log) -> None:
-    """Forget jobs that ended so long ago, with their files."""
+def remove_expired(jobs: JobEngine, blobs: BlobStore, strays: Strays, lifetime_s: float, log: Log) -> None:
+    """Forget jobs that ended so long ago, with their files, and files that belong to no job."""
     try:
         for identifier in jobs.ended_before(datetime.now(UTC) - timedelta(seconds=lifetime_s)):
             JobFiles(blobs, identifier).remove()
             jobs.forget(identifier)
+        strays.sweep()
     except (OSError, DBAPIError, Overloaded):
         log.warning("expired jobs cannot be removed")
 

@@ -2,22 +2,22 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Iterator
+from contextlib import suppress
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Form, Path, Request
-from starlette.concurrency import run_in_threadpool
+from fastapi import APIRouter, Form, Path, Request
 from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
 from zipstream import ZipStream  # type: ignore[import-untyped]
 
 from model.inference.surface import require_step
 from service import use_cases
-from service.errors import Cancelled, NotReady
-from service.job_files import JobFiles
+from service.errors import Cancelled, NotReady, Overloaded
+from service.job_files import JobFiles, remove_job
 from service.job_ports import JobState, JobStatus
 from service.job_presentation import job_summary
 from service.job_results import MANIFEST, result_members
 from service.job_schemas import JobForm, JobSummary
-from service.job_submission import require_first_stack
+from service.job_submission import require_archive
 from service.ports import RECONSTRUCTION_JOB, SAMPLES_JOB
 from service.request_schemas import parse_annotated
 from service.routes.dependencies import Services, WithServices, address
@@ -25,12 +25,14 @@ from service.routes.job_requests import (
     JOB_ACCEPTED,
     JOBS_PATH,
     IdempotencyKey,
+    Turns,
     accepted_job,
     submit,
     submittable_model,
+    turns_of,
 )
-from service.routes.multipart import require_multipart
 from service.routes.responses import ZIP, attachment, files, problems
+from service.routes.strict import StrictRoute
 
 #: How often (s) a job is looked at for its events, and how often a silent line is sent so that proxies stay.
 _EVENT_POLL_S, _EVENT_SILENCE_S = 0.5, 15.0
@@ -41,14 +43,13 @@ Identifier = Annotated[str, Path(alias="id", description="identifier of the job"
 
 def jobs_router() -> APIRouter:
     """The routes."""
-    router = APIRouter(prefix=JOBS_PATH, tags=["jobs"])
+    router = APIRouter(prefix=JOBS_PATH, tags=["jobs"], route_class=StrictRoute)
     router.add_api_route(
         "",
         create_job,
         methods=["POST"],
         status_code=202,
         response_model=JobSummary,
-        dependencies=[Depends(require_multipart)],
         summary="Bulk sampling, or a reconstruction for each mask of a ZIP",
         responses={202: JOB_ACCEPTED, **problems(400, 413, 415, 422, 503, 507)},
     )
@@ -59,7 +60,7 @@ def jobs_router() -> APIRouter:
         methods=["GET"],
         response_model=JobSummary,
         summary="State and progress",
-        responses=problems(404, 503),
+        responses=problems(404, 422, 503),
     )
     router.add_api_route(
         one,
@@ -67,7 +68,7 @@ def jobs_router() -> APIRouter:
         methods=["DELETE"],
         response_model=JobSummary,
         summary="Cancel a job, or forget one that has ended",
-        responses={204: {"description": "it had ended, and is gone with its files"}, **problems(404, 503)},
+        responses={204: {"description": "it had ended, and is gone with its files"}, **problems(404, 422, 503)},
     )
     router.add_api_route(
         f"{one}/events",
@@ -75,7 +76,7 @@ def jobs_router() -> APIRouter:
         methods=["GET"],
         response_class=StreamingResponse,
         summary="Progress as it happens",
-        responses={200: _EVENTS, **problems(404, 503)},
+        responses={200: _EVENTS, **problems(404, 422, 503)},
     )
     router.add_api_route(
         f"{one}/result",
@@ -86,52 +87,66 @@ def jobs_router() -> APIRouter:
         responses={
             200: files([ZIP], f"one file an item; {MANIFEST} comes last"),
             303: {"description": "a single reconstruction stands at the address in Location"},
-            **problems(404, 409, 503),
+            **problems(404, 409, 422, 503),
         },
     )
     return router
 
 
-def create_job(
+async def create_job(
     request: Request,
     form: Annotated[JobForm, Form(media_type="multipart/form-data")],
     services: WithServices,
     key: IdempotencyKey = None,
 ) -> Response:
     """Answers at once; the work is done by other processes and goes on after a restart."""
+    return accepted_job(request, await turns_of(request).run(_submitted, services, form, key))
+
+
+def _submitted(services: Services, form: JobForm, key: str | None) -> JobStatus:
     argument = form.argument(submittable_model(services, form.model))
     _require_feasible(services, form.kind, argument)
     inputs = [] if form.archive is None else [form.archive.file.read()]
     for archive in inputs:
-        require_first_stack(parse_annotated(form.annotated), archive)
-    return accepted_job(request, submit(services, form.kind, argument, inputs, key))
+        require_archive(archive, parse_annotated(form.annotated), services.settings.archive_limits)
+    return submit(services, form.kind, argument, inputs, key)
 
 
-def read_job(identifier: Identifier, request: Request, services: WithServices) -> JobSummary:
+async def read_job(identifier: Identifier, request: Request, services: WithServices) -> JobSummary:
     """Items that are made, and the estimated time to the end."""
-    return job_summary(services.jobs.status(identifier), address(request, ""))
+    status = await turns_of(request).run(services.jobs.status, identifier)
+    return job_summary(status, address(request, ""))
 
 
-def end_job(identifier: Identifier, request: Request, services: WithServices) -> Response:
+async def end_job(identifier: Identifier, request: Request, services: WithServices) -> Response:
     """What runs stops within a second; a job that had ended is forgotten."""
-    if services.jobs.status(identifier).state.is_final:
-        JobFiles(services.blobs, identifier).remove()
-        services.jobs.forget(identifier)
+    cancelled = await turns_of(request).run(_ended, services, identifier)
+    if cancelled is None:
         return Response(status_code=204)
-    summary = job_summary(services.jobs.cancel(identifier), address(request, ""))
-    return JSONResponse(summary.model_dump(mode="json"))
+    return JSONResponse(job_summary(cancelled, address(request, "")).model_dump(mode="json"))
+
+
+def _ended(services: Services, identifier: str) -> JobStatus | None:
+    """A job that is cancelled now; None for one that had ended, and is forgotten."""
+    if not services.jobs.status(identifier).state.is_final:
+        return services.jobs.cancel(identifier)
+    remove_job(services.blobs, services.store, identifier)
+    services.jobs.forget(identifier)
+    remove_job(services.blobs, services.store, identifier)  # a part that ran until now; one that still runs does it
+    return None
 
 
 async def read_events(identifier: Identifier, request: Request, services: WithServices) -> Response:
     """An event `progress` with the job's summary at each change, then one called `end`."""
-    first = await run_in_threadpool(services.jobs.status, identifier)
-    stream = _events(services, first, address(request, ""))
+    turns = turns_of(request)
+    first = await turns.run(services.jobs.status, identifier)
+    stream = _events(services, turns, first, address(request, ""))
     return StreamingResponse(stream, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 
 
-def read_result(identifier: Identifier, request: Request, services: WithServices) -> Response:
+async def read_result(identifier: Identifier, request: Request, services: WithServices) -> Response:
     """A ZIP that streams while it is read; the same items as of single requests."""
-    status = services.jobs.status(identifier)
+    status = await turns_of(request).run(services.jobs.status, identifier)
     if status.state is JobState.CANCELLED:
         raise Cancelled("The job was cancelled, so it has no result.")
     if status.state is not JobState.DONE or status.result is None:
@@ -143,7 +158,7 @@ def read_result(identifier: Identifier, request: Request, services: WithServices
     return StreamingResponse(chunks, media_type=ZIP, headers=attachment(f"{status.kind}.zip"))
 
 
-async def _events(services: Services, status: JobStatus, prefix: str) -> AsyncIterator[str]:
+async def _events(services: Services, turns: Turns, status: JobStatus, prefix: str) -> AsyncIterator[str]:
     told, silent_s = None, 0.0
     while True:
         now = (status.state, status.done, status.total)
@@ -158,7 +173,8 @@ async def _events(services: Services, status: JobStatus, prefix: str) -> AsyncIt
             yield ":\n\n"
         await asyncio.sleep(_EVENT_POLL_S)
         silent_s += _EVENT_POLL_S
-        status = await run_in_threadpool(services.jobs.status, status.id)
+        with suppress(Overloaded):  # the database is away; the next look may find it
+            status = await turns.run(services.jobs.status, status.id)
 
 
 def _zip(job: JobFiles, kind: str, count: int) -> Iterator[bytes]:

@@ -1,5 +1,7 @@
 """``/healthz``, ``/readyz`` and ``/metrics``."""
 
+from anyio import CapacityLimiter
+from anyio.to_thread import run_sync
 from fastapi import APIRouter, Request
 from starlette.responses import JSONResponse, Response
 
@@ -55,4 +57,6 @@ async def readiness(request: Request, services: WithServices) -> Response:
 
 async def metrics(services: WithServices) -> Response:
     """Requests, latencies of requests and stages, queue and memory."""
-    return Response(services.metrics.exposition(), media_type=METRICS_MEDIA_TYPE)
+    # In a thread beside those of other requests: what holds them up is to be seen here.
+    text = await run_sync(services.metrics.exposition, limiter=CapacityLimiter(1))
+    return Response(text, media_type=METRICS_MEDIA_TYPE)

@@ -2,6 +2,7 @@
 
 import io
 import json
+import time
 import zipfile
 
 import pytest
@@ -144,6 +145,45 @@ def test_a_cancelled_job_stops_and_an_ended_one_is_forgotten(client):
 def test_requests_at_fault_are_refused_by_part(client, parts, part, status):
     answer = client.post(JOBS, files=form(**parts))
     assert (answer.status_code, answer.json()["part"]) == (status, part)
+
+
+def test_a_job_is_forgotten_with_its_result_and_all_that_a_running_part_still_writes(client, app):
+    accepted = client.post("/v1/reconstructions", files=mask_parts(), headers={"Prefer": "respond-async"})
+    summary = ended(client, accepted.headers["location"])
+    assert client.get(summary["links"]["result"]).status_code == 200
+    assert client.delete(summary["links"]["self"]).status_code == 204
+    assert client.get(summary["links"]["result"]).status_code == 404
+
+    job = client.post(JOBS, files=form(kind="samples", count=1000, format="npz")).json()
+    while client.get(job["links"]["self"]).json()["state"] == "queued":
+        time.sleep(0.05)
+    time.sleep(0.3)
+    assert client.delete(job["links"]["self"]).json()["state"] == "cancelled"
+    assert client.delete(job["links"]["self"]).status_code == 204
+    ended(client, client.post(JOBS, files=form(kind="samples", count=2)).headers["location"])  # the worker is free
+    assert list(app.state.services.blobs.list(f"jobs/{job['id']}/")) == []
+
+
+def test_a_damaged_mask_of_an_archive_is_an_entry_and_stops_no_other(client):
+    archive = bytearray(archive_of(a=mask_bytes(), b=mask_bytes((12.0, 9.0, 8.0))))
+    archive[archive.rindex(b"masks/b.nii", 0, archive.index(b"PK\x01\x02")) + 500] ^= 0xFF  # its checksum is wrong now
+    parts = {**form(kind="reconstructions", uncertainty="none"), "archive": ("masks.zip", bytes(archive))}
+    summary = ended(client, client.post(JOBS, files=parts).headers["location"])
+    assert (summary["state"], summary["done"]) == ("done", 2)
+    first, second = json.loads(members(client.get(summary["links"]["result"]))["manifest.json"])["reconstructions"]
+    assert first["summary"]["fit"]["converged"]
+    assert second == {"mask": "masks/b.nii", "problem": "The mask is damaged in the archive; pack it anew."}
+
+
+@pytest.mark.parametrize(
+    ("archive", "status"),
+    [(b"hello", 422), (archive_of(a=b"1")[:-40], 422), (archive_of(a=bytes(60_000), b=bytes(60_000)), 413)],
+    ids=["no ZIP", "its end is gone", "too large together"],
+)
+def test_an_archive_that_cannot_be_unpacked_becomes_no_job(tmp_path, archive, status):
+    with running(app_for(tmp_path, max_job_bytes=100_000)) as client:
+        answer = client.post(JOBS, files={**form(kind="reconstructions"), "archive": ("masks.zip", archive)})
+    assert (answer.status_code, answer.json()["part"]) == (status, "archive")
 
 
 def test_an_archive_without_masks_fails(client):

@@ -40,6 +40,8 @@ def test_what_is_put_is_got_listed_and_deleted(blobs, tmp_path):
     assert (blobs.get("a/b/one"), len(blobs.get("a/c/two"))) == (b"2", 100_000)
     assert set(blobs.list("a/")) == {"a/b/one", "a/c/two"}
     assert blobs.exists("a/b/one")
+    assert set(blobs.folders("a/")) == {"b", "c"}
+    assert list(blobs.folders("nothing/")) == []
     blobs.delete("a/b/")
     assert not blobs.exists("a/b/one")
     assert set(blobs.list("a/")) == {"a/c/two"}
@@ -61,6 +63,28 @@ def test_results_survive_and_expire(blobs):
             store.load(identifier)
     assert store.sweep() == 2
     assert list(blobs.list("results/")) == []
+
+
+def test_a_result_is_deleted_however_its_identifier_is_written(blobs):
+    store = BlobResultStore(blobs, lifetime_s=10.0)
+    kept = store.save(outcome_of())
+    store.delete(kept.id.upper())
+    with pytest.raises(UnknownResult):
+        store.load(kept.id)
+
+
+def test_a_result_that_was_saved_again_lives_as_long_as_it_says(blobs):
+    now = [1000.0]
+    store = BlobResultStore(blobs, lifetime_s=100.0, clock=lambda: now[0])
+    identifier = store.save(outcome_of()).id
+    now[0] = 1090.0
+    store.save(outcome_of(), identifier)
+    now[0] = 1101.0
+    assert store.sweep() == 0
+    assert store.load(identifier).id == identifier
+    now[0] = 1190.0
+    assert store.sweep() == 1
+    assert list(blobs.list("expiry/")) == []
 
 
 def test_storage_that_does_not_answer_is_a_failure_of_the_medium(endpoint):

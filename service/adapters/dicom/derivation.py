@@ -22,8 +22,10 @@ from service.adapters.image_guard import LPS_TO_RAS
 from service.ports import Outcome
 
 MANUFACTURER = "MorphoFlow"
-#: Stands in every description: what these objects are, and what they are not for.
-DISCLAIMER = "derived, not for primary diagnosis"
+#: Stands in every description: what these objects are not for.
+PURPOSE = "not for primary diagnosis"
+#: Stands in the report: what the results are, and what they are not for.
+DISCLAIMER = f"derived, {PURPOSE}"
 #: First number of the series that results are put in, by what they hold.
 SERIES_NUMBERS = {"segmentation": 9001, "maps": 9002, "report": 9003, "model": 9004}
 #: How far the surface may leave the outermost voxels' centres before the segmentation counts as cut (voxels).
@@ -67,9 +69,8 @@ class Derivation:
         return bool((index < -CUT_MARGIN).any() or (index > np.array(grid.shape) - 1 + CUT_MARGIN).any())
 
     def description(self, what: str) -> str:
-        """At most 64 characters (VR LO)."""
-        cut = ", cut at the images' border" if self.is_cut else ""
-        return f"{what} ({DISCLAIMER}{cut})"[:64]
+        """What an object holds, whether that is cut, and what it is not for; 64 characters at most (VR LO)."""
+        return f"{what}, CUT at border ({PURPOSE})" if self.is_cut else f"{what} ({DISCLAIMER})"
 
     def equipment(self) -> dict[str, Any]:
         """The maker of the objects as highdicom's arguments."""

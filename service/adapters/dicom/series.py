@@ -6,15 +6,9 @@ from dataclasses import dataclass
 from pydicom import Dataset
 
 from model.errors import InvalidGeometry
-from model.geometry import Grid
-from service.adapters.dicom.objects import quiet
-from service.adapters.dicom.planes import FramePlane, frame_planes, parallel_groups, stack_grid
-
-#: Elements of patient and study that every image has to have, if without a value (type 2; PS3.3, C.7.1.1 and C.7.2.1).
-COMMON = (
-    *("PatientName", "PatientID", "PatientBirthDate", "PatientSex"),
-    *("AccessionNumber", "StudyID", "StudyDate", "StudyTime", "ReferringPhysicianName"),
-)
+from service.adapters.dicom.headers import completed
+from service.adapters.dicom.objects import tolerant
+from service.adapters.dicom.planes import FramePlane, ImageGrid, complete_places, frame_planes, grid_at
 
 
 @dataclass(frozen=True)
@@ -22,15 +16,15 @@ class Series:
     """Images of one series in the order of their planes.
 
     Attributes:
-        images: data sets without pixels, single-frame and in order, or one multi-frame.
+        images: headers as `completed` makes them, single-frame and in order, or one multi-frame.
         planes: of each frame, in the order of the images and their frames.
-        grid: of all frames (RAS); index axes are column, row and frame.
+        grid: of all frames (RAS), in the images' frame of reference; index axes are column, row and frame.
         order: index along the grid's last axis of each frame.
     """
 
     images: tuple[Dataset, ...]
     planes: tuple[FramePlane, ...]
-    grid: Grid
+    grid: ImageGrid
     order: tuple[int, ...]
 
 
@@ -38,27 +32,27 @@ def series_of(images: Sequence[Dataset], part: str = "series") -> Series:
     """Order the images of a series and find their grid.
 
     Raises:
-        InvalidGeometry: no image, frames that are not parallel, several at one place, or gaps between them.
+        InvalidGeometry: no image, several of many frames, frames in several directions, shifted against each
+            other, several at one place, or gaps between them.
         UnreadableImage: an image without a plane.
+        InputError: a header that results cannot be made from.
     """
     if not images:
         raise InvalidGeometry(f"The {part} has no images; those that were drawn on are needed", part=part)
-    found = [(completed(image), frame_planes(image, part)) for image in images]
+    if len(images) > 1 and any("PerFrameFunctionalGroupsSequence" in image for image in images):
+        raise InvalidGeometry(
+            f"The {part} has {len(images)} images, multi-frame ones among them; "
+            "single-frame images, or one multi-frame image, are accepted",
+            part=part,
+        )
+    found = [(image, frame_planes(image, part)) for image in images]
     first = found[0][1][0]
     found.sort(key=lambda item: float(first.offset(item[1][0])[2]))
     planes = [plane for _, own in found for plane in own]
-    grid, places = stack_grid(planes, int(images[0].Columns), int(images[0].Rows))
-    if len(parallel_groups(planes)) > 1 or sorted(places) != list(range(len(planes))):
-        raise InvalidGeometry(
-            f"The {part} is no regular stack of planes; parallel ones at equal distances are accepted", part=part
-        )
-    return Series(tuple(image for image, _ in found), tuple(planes), grid, tuple(int(place) for place in places))
-
-
-def completed(image: Dataset) -> Dataset:
-    """The image with every element that those derived from it must carry over, empty where it has none."""
-    with quiet():
-        for name in COMMON:
-            if name not in image:
-                setattr(image, name, None)
-    return image
+    places, step = complete_places(planes, part)
+    with tolerant(part):
+        columns, rows = int(images[0].Columns), int(images[0].Rows)
+    grid = grid_at(planes, places, step, columns, rows)
+    ordered = completed([image for image, _ in found], grid, part)
+    named = ImageGrid(grid.shape, grid.affine, str(ordered[0].get("FrameOfReferenceUID") or ""))
+    return Series(ordered, tuple(planes), named, tuple(int(place) for place in places))

@@ -2,24 +2,28 @@
 
 import threading
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from datetime import UTC, datetime
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
+import sqlalchemy as sa
 from dbos import DBOSClient, WorkflowStatus, WorkflowStatusString, error
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.exc import TimeoutError as SQLAlchemyTimeout
 
 from service.adapters.jobs.database import (
     APPLICATION,
+    CONNECT_S,
     JOB,
     JOBS_QUEUE,
     PARTS_QUEUE,
     RECORDS_VERSION,
     SCHEMA,
     Leases,
+    is_postgres,
     json_serializer,
+    open_engine,
     prepare,
     queue_of,
 )
@@ -28,6 +32,8 @@ from service.job_ports import JobState, JobStatus, Record
 
 P = ParamSpec("P")
 T = TypeVar("T")
+#: Connections to PostgreSQL, beside those of the leases.
+CONNECTIONS = 3
 #: Event of a running job that holds its items: done and total.
 PROGRESS = "progress"
 _NAMESPACE = uuid.UUID("6d6f7270-686f-5f6c-8f77-6a6f62732d31")
@@ -38,6 +44,8 @@ _STATES = {
     WorkflowStatusString.SUCCESS.value: JobState.DONE,
     WorkflowStatusString.CANCELLED.value: JobState.CANCELLED,
 }
+#: Jobs of one query.
+_ASKED_FOR = 500
 _FAULT = "The job met a fault of the service; its logs hold more under the job's identifier."
 
 
@@ -51,9 +59,13 @@ def _answered(method: Callable[P, T]) -> Callable[P, T]:
         except (DBAPIError, SQLAlchemyTimeout, error.DBOSException) as fault:
             if isinstance(fault, error.DBOSException) and not isinstance(fault.__cause__, DBAPIError):
                 raise
-            raise Overloaded("The jobs' database does not answer; send the request again later.") from fault
+            raise _away() from fault
 
     return tried
+
+
+def _away() -> Overloaded:
+    return Overloaded("The jobs' database does not answer; send the request again later.")
 
 
 class DbosJobs:
@@ -66,6 +78,7 @@ class DbosJobs:
     def __init__(self, url: str) -> None:
         self._url = url
         self._lock = threading.Lock()
+        self._engine: sa.Engine | None = None
         self._opened: tuple[DBOSClient, Leases] | None = None
 
     def new_id(self, kind: str, key: str | None = None) -> str:
@@ -110,6 +123,16 @@ class DbosJobs:
         return bool(found) and found[0].status in ("ENQUEUED", "PENDING", "DELAYED")
 
     @_answered
+    def known(self, identifiers: Collection[str]) -> set[str]:
+        """Those of the identifiers that a job has."""
+        wanted, found = list(identifiers), set[str]()
+        for start in range(0, len(wanted), _ASKED_FOR):
+            some = wanted[start : start + _ASKED_FOR]
+            rows = self._client.list_workflows(workflow_ids=some, name=JOB, load_input=False, load_output=False)
+            found |= {row.workflow_id for row in rows}
+        return found
+
+    @_answered
     def forget(self, identifier: str) -> None:
         """Remove the record of a job and its parts."""
         self._client.delete_workflow(identifier, delete_children=True)
@@ -144,27 +167,41 @@ class DbosJobs:
                 client, leases = self._opened
                 client.destroy()
                 leases.close()
-            self._opened = None
+            if self._engine is not None:
+                self._engine.dispose()
+            self._opened = self._engine = None
 
     @property
     def _client(self) -> DBOSClient:
         return self._open()[0]
 
     def _open(self) -> tuple[DBOSClient, Leases]:
-        with self._lock:
-            if self._opened is None:
-                serializer = json_serializer()
-                prepare(self._url)
-                client = DBOSClient(
-                    system_database_url=self._url,
-                    dbos_system_schema=SCHEMA,
-                    serializer=serializer,
-                    application_name=APPLICATION,
-                    retry_connection_errors=False,
-                    system_database_pool_size=3,
-                )
-                self._opened = client, Leases(self._url)
+        if self._opened is not None:
             return self._opened
+        if not self._lock.acquire(timeout=CONNECT_S):  # another thread connects, and is not answered
+            raise _away()
+        try:
+            if self._opened is None:
+                self._opened = self._connected()
+            return self._opened
+        finally:
+            self._lock.release()
+
+    def _connected(self) -> tuple[DBOSClient, Leases]:
+        serializer = json_serializer()
+        prepare(self._url)
+        if is_postgres(self._url) and self._engine is None:
+            self._engine = open_engine(self._url, CONNECTIONS)
+        client = DBOSClient(
+            system_database_url=self._url,
+            system_database_engine=self._engine,
+            dbos_system_schema=SCHEMA,
+            serializer=serializer,
+            application_name=APPLICATION,
+            retry_connection_errors=False,
+            system_database_pool_size=CONNECTIONS,
+        )
+        return client, Leases(self._url)
 
 
 def job_status(workflow: WorkflowStatus, progress: Mapping[str, Any]) -> JobStatus:

@@ -8,6 +8,7 @@ import logging
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
 from dbos import DBOS, DBOSPortableJSONSerializer
@@ -26,6 +27,10 @@ JOBS_QUEUE, PATIENT_QUEUE, PARTS_QUEUE = "jobs", "patient", "parts"
 JOB, PART = "job", "part"
 #: Schema of DBOS's tables on PostgreSQL.
 SCHEMA = "dbos"
+#: A connection is there within so long (s), a new one or one that others give back, or the database is away.
+CONNECT_S = 3
+#: What one statement, and a transaction that does nothing, may take on PostgreSQL (ms).
+_STATEMENT_MS, _IDLE_MS = 10_000, 60_000
 
 _LEASES = sa.Table(
     "morphoflow_leases",
@@ -59,7 +64,7 @@ def prepare(url: str) -> None:
         with sqlite3.connect(file, timeout=30.0) as connection:
             connection.execute("PRAGMA journal_mode=WAL")  # readers do not wait for writers; stays with the file
         file.chmod(0o600)
-    DBOS.migrate(url, schema=SCHEMA)
+    DBOS.migrate(bounded(url), schema=SCHEMA)
     engine = open_engine(url)
     try:
         _LEASES.create(engine, checkfirst=True)
@@ -70,12 +75,40 @@ def prepare(url: str) -> None:
         engine.dispose()
 
 
-def open_engine(url: str) -> sa.Engine:
-    """Connections of this project's own, beside those of DBOS."""
+def is_postgres(url: str) -> bool:
+    """Whether the database is one of several machines."""
+    return make_url(url).get_backend_name() != "sqlite"
+
+
+def bounded(url: str) -> str:
+    """The address with a bound on how long connecting takes, unless it has one; a server may accept and not answer."""
     parsed = make_url(url)
-    if parsed.get_backend_name() == "sqlite":
-        return sa.create_engine(parsed, connect_args={"timeout": 30.0})
-    return sa.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_size=2, pool_pre_ping=True)
+    if not is_postgres(url) or "connect_timeout" in parsed.query:
+        return url
+    return parsed.update_query_dict({"connect_timeout": str(CONNECT_S)}).render_as_string(hide_password=False)
+
+
+def open_engine(url: str, connections: int = 2) -> sa.Engine:
+    """Connections of this project's own; none is waited for longer than `CONNECT_S`."""
+    if not is_postgres(url):
+        return sa.create_engine(url, connect_args={"timeout": 30.0})
+    engine = sa.create_engine(
+        make_url(bounded(url)).set(drivername="postgresql+psycopg"),
+        pool_size=connections,
+        max_overflow=0,
+        pool_timeout=CONNECT_S,
+        pool_pre_ping=True,
+    )
+    sa.event.listen(engine, "connect", _bound_statements)
+    return engine
+
+
+def _bound_statements(connection: Any, _record: object) -> None:
+    """Set here and not while connecting, where a pooler between may refuse it."""
+    with connection.cursor() as cursor:
+        cursor.execute(f"SET statement_timeout = {_STATEMENT_MS}")
+        cursor.execute(f"SET idle_in_transaction_session_timeout = {_IDLE_MS}")
+    connection.commit()  # the pool rolls back what is not
 
 
 class Leases:

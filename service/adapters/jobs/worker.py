@@ -29,6 +29,7 @@ from service.adapters.jobs.database import (
     RECORDS_VERSION,
     SCHEMA,
     Leases,
+    bounded,
     json_serializer,
     prepare,
     queue_of,
@@ -79,7 +80,8 @@ def running_worker(kinds: Sequence[JobKind], options: WorkerOptions, log: Log | 
     jobs = DbosJobs(options.url)
     config: DBOSConfig = {
         "name": APPLICATION,
-        "system_database_url": options.url,
+        # No bound on statements here: a worker waits for a slow database, nobody waits for it.
+        "system_database_url": bounded(options.url),
         "dbos_system_schema": SCHEMA,
         "application_version": RECORDS_VERSION,
         "executor_id": options.executor,
@@ -121,7 +123,10 @@ def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: Busy, log: Log
         check = _rarely(lambda: _require_wanted(jobs, job))
         check()
         with busy.one(), _told(log, job, name):
-            return dict(DBOS.run_step(_tried_again(name), kinds[kind].parts[name], item, check))
+            try:
+                return dict(DBOS.run_step(_tried_again(name), kinds[kind].parts[name], item, check))
+            finally:
+                _forget_deleted(jobs, job, kinds[kind])
 
     @DBOS.workflow(name=JOB, max_recovery_attempts=None)
     def job(kind: str, argument: dict[str, Any]) -> dict[str, Any]:
@@ -249,6 +254,13 @@ def _require_wanted(jobs: DbosJobs, job: str) -> None:
     with suppress(Overloaded):  # a database that is away does not say that nobody wants the job
         if not jobs.is_wanted(job):
             raise Cancelled("The job was cancelled.")
+
+
+def _forget_deleted(jobs: DbosJobs, job: str, kind: JobKind) -> None:
+    """Remove what a part may have written after its job had been deleted with all files."""
+    with suppress(Overloaded, OSError):  # what stays is found to be astray later
+        if not jobs.known([job]):
+            kind.forget(job)
 
 
 def _rarely(check: Check) -> Check:

@@ -62,6 +62,40 @@ def test_too_large_is_decided_in_little_memory(bad):
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize(("kind", "label", "bytes_a_voxel"), [("u1", 1, 5), ("f8", 1, 5), ("f8", 300, 7)])
+def test_memory_grows_with_the_voxels_and_not_with_their_type(kind, label, bytes_a_voxel):
+    values = np.zeros((160, 160, 160), kind)
+    values[40:60, 40:60, ::20] = label
+    data = nifti(values)
+    tracemalloc.start()
+    try:
+        stack = read_mask(data, "mask[0]", ImageLimits(values.nbytes, values.size))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_array_equal(stack.foreground, values > 0)
+    assert peak < bytes_a_voxel * values.size + 8 * MEBIBYTE
+
+
+@pytest.mark.parametrize("label", [254, 300, 70_000, 2**31 - 1, 2**33])
+def test_labels_of_any_size_are_told_apart(label):
+    values = np.where(drawn() == 1, float(label), 0.0)
+    values[0, 0, 0] = 2
+    stack = read_mask(nifti(values), "mask[0]", LIMITS, frozenset({label}))
+    np.testing.assert_array_equal(stack.foreground, drawn() == 1)
+
+
+def test_labels_that_take_more_room_than_the_limit_are_too_large():
+    values = np.where(drawn() == 1, 2.0**33, 0.0)
+    with pytest.raises(TooLarge, match="bits"):
+        read_mask(nifti(values), "mask[0]", ImageLimits(10**6, values.size))
+
+
+def test_values_beyond_all_labels_are_refused():
+    with pytest.raises(InvalidMask, match="label"):
+        read_mask(nifti(drawn() * 1e300), "mask[0]", LIMITS)
+
+
 @pytest.mark.parametrize("kind", [np.uint8, np.int16, np.int32, np.float32, np.float64])
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("version", [nib.Nifti1Image, nib.Nifti2Image])

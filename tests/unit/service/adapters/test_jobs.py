@@ -1,15 +1,11 @@
 """The engine of jobs on real databases: SQLite always, PostgreSQL where one listens on this machine."""
 
-import os
 import subprocess
 import sys
 import threading
 import time
-import uuid
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 
-import psycopg
 import pytest
 
 from model.errors import InvalidMask
@@ -18,31 +14,6 @@ from service.adapters.jobs.database import Leases
 from service.adapters.jobs.worker import WorkerOptions, running_worker
 from service.errors import UnknownJob
 from service.job_ports import JobKind, JobState, JobStatus
-
-POSTGRES = os.environ.get("MORPHOFLOW_TEST_POSTGRES", "postgresql://postgres@127.0.0.1:5432")
-
-
-@pytest.fixture
-def sqlite_url(tmp_path):
-    return f"sqlite:///{tmp_path / 'jobs.sqlite'}"
-
-
-@pytest.fixture
-def postgres_url() -> Iterator[str]:
-    name = f"jobs_{uuid.uuid4().hex}"
-    try:
-        connection = psycopg.connect(f"{POSTGRES}/postgres", autocommit=True, connect_timeout=2)
-    except psycopg.OperationalError:
-        pytest.skip("no PostgreSQL on this machine (MORPHOFLOW_TEST_POSTGRES)")
-    connection.execute(f"CREATE DATABASE {name}")
-    yield f"{POSTGRES}/{name}"
-    connection.execute(f"DROP DATABASE {name} WITH (FORCE)")
-    connection.close()
-
-
-@pytest.fixture(params=["sqlite_url", "postgres_url"])
-def url(request) -> str:
-    return request.getfixturevalue(request.param)
 
 
 def squares(seen: list[int], fail: tuple[int, ...] = ()) -> JobKind:
@@ -131,6 +102,30 @@ def test_cancelling_stops_what_runs_and_what_waits(url):
         assert ended.wait(30.0)
         assert jobs.backlog() == 0
     assert jobs.cancel(identifier).state is JobState.CANCELLED
+    jobs.close()
+
+
+def test_a_part_that_ends_after_its_job_was_deleted_leaves_nothing(url):
+    entered, deleted, forgotten = threading.Event(), threading.Event(), []
+
+    def late(_item, _check):
+        entered.set()
+        assert deleted.wait(30.0)
+        return {}
+
+    kind = JobKind("late", lambda run, _: {"all": run.spread("part", [{}])}, {"part": late}, forgotten.append)
+    jobs = DbosJobs(url)
+    identifier, other = jobs.new_id("late"), jobs.new_id("late")
+    jobs.enqueue("late", {}, identifier)
+    with running_worker([kind], WorkerOptions(url, "a-0")):
+        assert entered.wait(30.0)
+        jobs.cancel(identifier)
+        jobs.forget(identifier)
+        deleted.set()
+        jobs.enqueue("late", {}, other)
+        assert awaited(jobs, other).state is JobState.DONE
+    assert forgotten == [identifier]
+    assert jobs.known([identifier, other]) == {other}
     jobs.close()
 
 

@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import highdicom as hd
@@ -126,6 +127,31 @@ def test_a_cut_object_says_so(derived):
     assert not derived[0].is_cut
     assert Derivation(derivation.drawing, series_of(short[:6]), derivation.outcome, derivation.anatomy, "k", "0").is_cut
     assert probability.shape == derivation.series.grid.shape
+
+
+def descriptions_of(found):
+    """Every description in an object and its items."""
+    names = ("SeriesDescription", "ContentDescription", "DocumentTitle", "ImageComments")
+    for element in found.iterall():
+        if element.keyword in names:
+            yield element.value
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_every_description_is_whole_and_fits(cut, derived):
+    derivation, probability = derived
+    if cut:
+        short = series_of(list(derivation.series.images[:8]))
+        derivation, probability = replace(derivation, series=short), probability[:, :, :8]
+    assert derivation.is_cut is cut
+    for name, found in result_objects(derivation, probability).items():
+        told = list(descriptions_of(reread(found)))
+        assert told, name
+        for text in told:
+            assert len(text) <= 64
+            assert "not for primary diagnosis" in text
+            assert text.endswith(")")
+            assert ("CUT at border" in text) is cut
 
 
 def dcmqi(program: str) -> str:

@@ -1,0 +1,131 @@
+"""The masks of a ZIP that was sent: which of its members they are, and how much they may hold together."""
+
+import io
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from model.errors import InvalidParameter, TooLarge
+
+#: Files of an archive or a folder with these endings are masks; others are left out.
+MASK_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".mha", ".mhd", ".dcm")
+#: What the library raises over an archive or a member that is damaged, encrypted or of an unknown form.
+_DAMAGED = (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error, ValueError, OSError)
+#: Others are inflated without a bound by the library.
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_ENCRYPTED = 0x1
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class ArchiveLimits:
+    """What the masks of one archive may cost.
+
+    Attributes:
+        max_masks: how many there may be.
+        max_mask_bytes: of one of them, unpacked.
+        max_bytes: of all of them together, unpacked.
+    """
+
+    max_masks: int
+    max_mask_bytes: int
+    max_bytes: int
+
+
+@dataclass(frozen=True)
+class ArchivedMask:
+    """A mask of an archive: its content, or why it has none that can be used."""
+
+    name: str
+    content: bytes = b""
+    problem: str | None = None
+
+
+def open_archive(archive: bytes) -> zipfile.ZipFile:
+    """The archive with the list of its members read.
+
+    Raises:
+        InvalidParameter: not a ZIP, or one whose list of members is damaged.
+    """
+    try:
+        return zipfile.ZipFile(io.BytesIO(archive))
+    except _DAMAGED:
+        raise InvalidParameter("The part archive must be a ZIP that is whole.", part="archive") from None
+
+
+def masks_of(opened: zipfile.ZipFile, limits: ArchiveLimits) -> list[zipfile.ZipInfo]:
+    """The members that are masks, in the order of their names.
+
+    Raises:
+        TooLarge: more of them than a job may have, or more bytes together, as the list of members says.
+    """
+    found = sorted((info for info in opened.infolist() if _is_mask(info)), key=lambda info: info.filename)
+    if len(found) > limits.max_masks:
+        raise TooLarge(f"The archive must not hold more than {limits.max_masks} masks.", part="archive")
+    _require_room(sum(info.file_size for info in found if info.file_size <= limits.max_mask_bytes), limits)
+    return found
+
+
+def masks_in(archive: bytes, limits: ArchiveLimits) -> Iterator[ArchivedMask]:
+    """The masks of an archive, one in memory at a time; one at fault stops no other.
+
+    Raises:
+        InvalidParameter, TooLarge: see `open_archive` and `masks_of`.
+    """
+    unpacked = 0
+    with open_archive(archive) as opened:
+        for info in masks_of(opened, limits):
+            mask = _read(opened, info, limits)
+            unpacked += len(mask.content)
+            _require_room(unpacked, limits)
+            yield mask
+
+
+def zip_of_folder(folder: Path) -> bytes:
+    """The masks below a folder as a ZIP, under their names relative to it."""
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w") as archive:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file() and path.name.lower().endswith(MASK_SUFFIXES) and not path.name.startswith("."):
+                archive.write(path, path.relative_to(folder).as_posix())
+    return target.getvalue()
+
+
+def _require_room(size: int, limits: ArchiveLimits) -> None:
+    if size > limits.max_bytes:
+        raise TooLarge(
+            f"The masks of the archive must not hold more than {limits.max_bytes} bytes together.", part="archive"
+        )
+
+
+def _read(opened: zipfile.ZipFile, info: zipfile.ZipInfo, limits: ArchiveLimits) -> ArchivedMask:
+    problem = _refusal(info, limits)
+    if problem is not None:
+        return ArchivedMask(info.filename, problem=problem)
+    content = bytearray()
+    try:
+        with opened.open(info) as member:
+            while len(content) <= limits.max_mask_bytes and (piece := member.read(_CHUNK)):
+                content += piece
+    except _DAMAGED:
+        return ArchivedMask(info.filename, problem="The mask is damaged in the archive; pack it anew.")
+    return ArchivedMask(info.filename, bytes(content))
+
+
+def _refusal(info: zipfile.ZipInfo, limits: ArchiveLimits) -> str | None:
+    """Why a mask is not even unpacked; None when it is."""
+    if info.file_size > limits.max_mask_bytes:
+        return f"The mask is larger than {limits.max_mask_bytes} bytes, the most that is accepted."
+    if info.flag_bits & _ENCRYPTED:
+        return "The mask is encrypted in the archive; a ZIP without password is accepted."
+    if info.compress_type not in _METHODS:
+        return "The mask is compressed in an unusual way; members of a ZIP must be stored or deflated."
+    return None
+
+
+def _is_mask(info: zipfile.ZipInfo) -> bool:
+    path = PurePosixPath(info.filename)
+    hidden = any(part.startswith((".", "__MACOSX")) for part in path.parts)
+    return not info.is_dir() and not hidden and path.name.lower().endswith(MASK_SUFFIXES)
