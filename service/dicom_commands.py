@@ -1,46 +1,106 @@
 """The commands ``deidentify`` and ``audit``."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from pydantic import BaseModel, Field
 
 from model.errors import InvalidParameter
 from service.adapters.image_guard import ImageLimits
 from service.adapters.nifti import write_nifti
-from service.console import writing
+from service.commands import JsonOption
+from service.console import echo_json, writing
 from service.extras import require_extra
 from service.settings import load_settings
+
+if TYPE_CHECKING:
+    from service.adapters.dicom.deidentification import LeftOut
+
+
+class LeftOutFile(BaseModel):
+    """A file of a study that nothing was made of."""
+
+    file: str = Field(description="Path below the folder of the study.")
+    reason: str
+
+
+class DeidentifiedStudy(BaseModel):
+    """What became of a study."""
+
+    objects: int = Field(description="Objects without identifiers that were written.")
+    label_maps: int = Field(description="Drawings that were written as label maps.")
+    unused_files: list[LeftOutFile] = Field(description="DICOM files that cannot be used.")
+    unused_drawings: list[LeftOutFile] = Field(description="Drawings without a label map.")
 
 
 def deidentify(
     study: Annotated[Path, typer.Argument(help="Folder with the DICOM files of a study.")],
     output: Annotated[Path, typer.Option(help="Folder to write; it must be empty or not there.")],
+    as_json: JsonOption = False,
 ) -> None:
     """Turn a study into training data: objects without identifiers, and drawings as label maps."""
     require_extra("pacs", needed_by="morphoflow deidentify")
-    from service.adapters.dicom import deidentification
-
     if not study.is_dir():
         raise InvalidParameter("The study must be a folder with DICOM files.", part="study")
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InvalidParameter("--output names a folder that is not empty; an empty one is accepted.", part="--output")
     settings = load_settings()
     limits = ImageLimits(max_bytes=settings.max_body_bytes, max_voxels=settings.max_voxels)
-    objects = list(deidentification.read_study(study))
-    if not objects:
-        raise InvalidParameter("The study holds no DICOM file; files with the DICOM prefix are accepted.", part="study")
-    maps = list(deidentification.label_maps(objects, limits))
     with writing("--output"):
-        for folder in (output / "dicom", output / "masks"):
-            folder.mkdir(parents=True)
-        for number, found in enumerate(objects):
-            path = output / "dicom" / f"{number:06d}.dcm"
-            deidentification.without_identifiers(found).save_as(path, enforce_file_format=True)
-        for number, drawn in enumerate(maps):
-            data = write_nifti(drawn.values, drawn.grid, "drawing")
-            (output / "masks" / f"{number:06d}.nii.gz").write_bytes(data)
-    typer.echo(f"{len(objects)} objects without identifiers, {len(maps)} drawings as label maps.")
+        done = _deidentify(study, output, limits)
+    for name, left_out in (("not used", done.unused_files), ("no label map", done.unused_drawings)):
+        for item in left_out:
+            typer.echo(f"{name}: {item.file}: {item.reason}", err=True)
+    if not done.objects:
+        raise InvalidParameter(
+            "The study holds no DICOM file that can be used; objects with the DICOM prefix, little endian, "
+            "uncompressed or RLE, are accepted.",
+            part="study",
+        )
+    echo_json(done) if as_json else typer.echo(_sentence(done))
+
+
+def _deidentify(study: Path, output: Path, limits: ImageLimits) -> DeidentifiedStudy:
+    """Write what can be used; the folder is made with the first object."""
+    from service.adapters.dicom import deidentification
+    from service.adapters.dicom.deidentification import LeftOut, StudyFile
+
+    kept: list[StudyFile] = []
+    unused: list[LeftOutFile] = []
+    undrawn: list[LeftOutFile] = []
+    maps = 0
+    for found in deidentification.read_study(study):
+        data = deidentification.cleared(found) if isinstance(found, StudyFile) else found
+        if isinstance(data, LeftOut):
+            unused.append(_schema(data))
+        elif isinstance(found, StudyFile):
+            _write(output / "dicom" / f"{len(kept):06d}.dcm", data)
+            kept.append(found)
+    # Drawn from the objects as they were written, so that what refers to what is as in them.
+    for drawn in deidentification.label_maps(kept, limits):
+        if isinstance(drawn, LeftOut):
+            undrawn.append(_schema(drawn))
+        else:
+            _write(output / "masks" / f"{maps:06d}.nii.gz", write_nifti(drawn.values, drawn.grid, "drawing"))
+            maps += 1
+    return DeidentifiedStudy(objects=len(kept), label_maps=maps, unused_files=unused, unused_drawings=undrawn)
+
+
+def _schema(found: "LeftOut") -> LeftOutFile:
+    return LeftOutFile(file=found.name, reason=found.reason)
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+
+
+def _sentence(done: DeidentifiedStudy) -> str:
+    left_out = [f"{len(done.unused_files)} files not used"] if done.unused_files else []
+    left_out += [f"{len(done.unused_drawings)} drawings without a label map"] if done.unused_drawings else []
+    written = f"{done.objects} objects without identifiers, {done.label_maps} drawings as label maps"
+    return f"{', '.join([written, *left_out])}."
 
 
 def audit(

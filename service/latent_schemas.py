@@ -15,7 +15,7 @@ MOST_STEPS = 64
 class InterpolationQuery(BaseModel):
     """Query of the way between two reconstructions."""
 
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+    model_config = ConfigDict(extra="forbid")
 
     other: str = Field(alias="with", description="identifier of the other result, of the same model")
     at: Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)] | None = Field(

@@ -1,19 +1,23 @@
 """Structured logs and metrics; each application has its own, nothing is registered globally.
 
 Neither holds a file name, a value of an image header, a query or the path of a request: only its
-route as it stands in the interface.
+route as it stands in the interface, and of a fault where in the program it arose.
 """
 
-import math
+import re
 import sys
 import time
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
 from typing import Any, TextIO
 
 import structlog
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
 
-from service.errors import Overloaded
+from model.errors import MorphoFlowError
+from service.job_figures import Recent
 from service.job_ports import JobEngine
 from service.ports import WorkEngine
 
@@ -21,8 +25,18 @@ from service.ports import WorkEngine
 LATENCY_BUCKETS_S = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 120.0)
 #: Severity of each level as the standard library counts it.
 SEVERITIES = {"debug": 10, "info": 20, "warning": 30, "error": 40}
+#: Exceptions of one chain, and frames of each, that are logged; of more frames the innermost.
+MOST_EXCEPTIONS, MOST_FRAMES = 16, 40
+#: How a trace that is text begins, a frame of it, and the kind of what was raised: a helper's fault comes through a
+#: pipe as one.
+_TRACE = "Traceback (most recent call last):\n"
+_FRAME = re.compile(r'^  File "(.+)", line (\d+), in (\S+)$', re.MULTILINE)
+_RAISED = re.compile(r"^[A-Za-z][\w.]*(?:Error|Exception)(?=:|$)", re.MULTILINE)
+#: The folder that holds this program's packages.
+_HOME = Path(__file__).parents[1]
 
 Log = Any
+ExceptionInfo = tuple[type[BaseException], BaseException, TracebackType | None]
 
 
 def make_log(level: str, stream: TextIO | None = None) -> Log:
@@ -32,11 +46,53 @@ def make_log(level: str, stream: TextIO | None = None) -> Log:
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.processors.dict_tracebacks,
+            structlog.processors.ExceptionRenderer(exception_told),
             structlog.processors.JSONRenderer(),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(SEVERITIES[level]),
     )
+
+
+def exception_told(exc_info: ExceptionInfo) -> list[dict[str, Any]]:
+    """An exception and what led to it, the last one first: kind, and where in the program it arose.
+
+    No values of variables. What an exception says is told of this program's own alone, whose sentences hold nothing of
+    anybody; a foreign one's may hold paths and contents of files.
+    """
+    return [_told(error) for error, _ in zip(_chain(exc_info[1]), range(MOST_EXCEPTIONS), strict=False)]
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    seen: set[int] = set()
+    waiting = [error]
+    while waiting:
+        found = waiting.pop(0)
+        if found is None or id(found) in seen:
+            continue
+        seen.add(id(found))
+        yield found
+        within = found.exceptions if isinstance(found, BaseExceptionGroup) else ()
+        before = found.__cause__ or (None if found.__suppress_context__ else found.__context__)
+        waiting = [*within, before, *waiting]
+
+
+def _told(error: BaseException) -> dict[str, Any]:
+    frames = [(code.filename, code.lineno, code.name) for code in traceback.extract_tb(error.__traceback__)]
+    told: dict[str, Any] = {"exc_type": type(error).__name__}
+    if str(error).startswith(_TRACE):
+        frames += _FRAME.findall(str(error))
+        told["raised"] = _RAISED.findall(str(error))
+    places = [{"filename": _place(file), "lineno": int(line or 0), "name": name} for file, line, name in frames]
+    told["frames"] = places[-MOST_FRAMES:]
+    return {**told, "exc_value": str(error)} if isinstance(error, MorphoFlowError) else told
+
+
+def _place(file: str) -> str:
+    """A file of code as seen from the folder that its package lies in."""
+    roots = [_HOME, *(Path(entry) for entry in sys.path if entry)]
+    within = [Path(file).relative_to(root) for root in roots if Path(file).is_relative_to(root)]
+    known = [found for found in within if found.suffix == ".py"]
+    return min(known, key=lambda found: len(found.parts)).as_posix() if known else "elsewhere"
 
 
 class Metrics:
@@ -61,11 +117,9 @@ class Metrics:
             buckets=LATENCY_BUCKETS_S,
             registry=self._registry,
         )
-        self.watch("morphoflow_work_waiting", "Requests that wait for a worker", engine.waiting)
-        self.watch(
-            "morphoflow_jobs_waiting_parts", "Parts of jobs that wait for a worker", lambda: _known(jobs.backlog)
-        )
-        self.watch("morphoflow_work_running", "Workers that are busy", engine.running)
+        self._gauge("morphoflow_work_waiting", "Requests that wait for a worker", engine.waiting)
+        self.watch("morphoflow_jobs_waiting_parts", "Parts of jobs that wait for a worker", jobs.backlog)
+        self._gauge("morphoflow_work_running", "Workers that are busy", engine.running)
         ProcessCollector(registry=self._registry)
 
     def exposition(self) -> bytes:
@@ -73,16 +127,11 @@ class Metrics:
         return generate_latest(self._registry)
 
     def watch(self, name: str, text: str, value: Callable[[], float]) -> None:
-        """Ask for a figure whenever metrics are read."""
+        """Ask a database or a storage for a figure when metrics are read; NaN while it does not answer."""
+        self._gauge(name, text, Recent(value))
+
+    def _gauge(self, name: str, text: str, value: Callable[[], float]) -> None:
         Gauge(name, text, registry=self._registry).set_function(value)
-
-
-def _known(figure: Callable[[], int]) -> float:
-    """The figure, or that there is none now (NaN): metrics are told even while a database is away."""
-    try:
-        return figure()
-    except Overloaded:
-        return math.nan
 
 
 class StageTimer:
@@ -110,7 +159,7 @@ def uvicorn_logging(level: str) -> dict[str, Any]:
     """Logging of the HTTP server itself (standard library, `dictConfig`), as JSON like everything else."""
     stages = [
         structlog.stdlib.ProcessorFormatter.remove_processors_meta,
-        structlog.processors.format_exc_info,
+        structlog.processors.ExceptionRenderer(exception_told),
         structlog.processors.JSONRenderer(),
     ]
     before = [structlog.stdlib.add_log_level, structlog.processors.TimeStamper(fmt="iso", utc=True)]

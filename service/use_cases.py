@@ -1,7 +1,7 @@
 """What the service can do, as plain functions of domain types: no HTTP, no settings, no clock."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -25,7 +25,7 @@ from model.inference.surface import covering_grid, require_step
 from model.inference.uncertainty import ShapeState, occupancy, voxel_entropy
 from model.interruption import Check, interruptible
 from service.errors import NotComputed
-from service.ports import Catalogue, ModeSource, Outcome, ResultStore, StoredResult
+from service.ports import Catalogue, ModeSource, Outcome
 
 #: A voxel belongs to the object from this probability on.
 OCCUPIED = 0.5
@@ -35,13 +35,17 @@ SURFACE_SD = "surface_sd_mm"
 MAX_SEED = 2**53 - 1
 
 
+def unchecked() -> None:
+    """A `Check` that lets everything pass."""
+
+
 def reconstruct(
     model: ShapeModel,
     stacks: tuple[MaskStack, ...],
     options: Options,
     max_voxels: int | None = None,
     watch: Watch = lambda stage: None,
-    check: Check = lambda: None,
+    check: Check = unchecked,
 ) -> Outcome:
     """Reconstruct the object of the stacks; the first one's grid is the input's grid.
 
@@ -58,11 +62,6 @@ def reconstruct(
     return Outcome(manifest.name, manifest.version, model.digest, options, stacks[0].grid, reconstruction)
 
 
-def keep(store: ResultStore, outcome: Outcome) -> StoredResult:
-    """Keep an outcome for later requests."""
-    return store.save(outcome)
-
-
 @dataclass(frozen=True)
 class Volume:
     """A voxel array on its grid."""
@@ -71,30 +70,39 @@ class Volume:
     grid: Grid
 
 
-def probability_map(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int) -> Volume:
+def probability_map(
+    catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int, check: Check = unchecked
+) -> Volume:
     """Occupancy probability on the input's grid, or on a grid around the surface at a spacing (mm).
+
+    Args:
+        check: here and below, called before each evaluation of the model; what it raises ends the work.
 
     Raises:
         NotComputed: the model that made the outcome is no longer loaded.
         TooLarge: the grid has more voxels than allowed.
     """
-    model = _same_model(catalogue, outcome)
+    model = interruptible(_same_model(catalogue, outcome), check)
     mesh = outcome.reconstruction.mesh
     grid = outcome.grid if spacing_mm is None else covering_grid(mesh, spacing_mm)
     require_voxels(grid, max_voxels)
     return Volume(occupancy(model, outcome.reconstruction.state, grid).astype(np.float32), grid)
 
 
-def segmentation(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int) -> Volume:
+def segmentation(
+    catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int, check: Check = unchecked
+) -> Volume:
     """Label map, 1 where the object is more likely than not; grid and errors as in `probability_map`."""
-    volume = probability_map(catalogue, outcome, spacing_mm, max_voxels)
+    volume = probability_map(catalogue, outcome, spacing_mm, max_voxels, check)
     return Volume((volume.array >= OCCUPIED).astype(np.uint8), volume.grid)
 
 
-def entropy_map(catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int) -> Volume:
+def entropy_map(
+    catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int, check: Check = unchecked
+) -> Volume:
     """Voxel entropy (nats); grid and errors as in `probability_map`, and `NotComputed` without uncertainty."""
     _require_uncertainty(outcome)
-    volume = probability_map(catalogue, outcome, spacing_mm, max_voxels)
+    volume = probability_map(catalogue, outcome, spacing_mm, max_voxels, check)
     return Volume(voxel_entropy(volume.array.astype(float)).astype(np.float32), volume.grid)
 
 
@@ -114,7 +122,7 @@ def compare(outcome: Outcome, other: Outcome) -> Mesh:
     return compared(outcome.reconstruction.mesh, other.reconstruction.mesh)
 
 
-def next_plane(catalogue: Catalogue, outcome: Outcome, among: Among) -> NextPlane:
+def next_plane(catalogue: Catalogue, outcome: Outcome, among: Among, check: Check = unchecked) -> NextPlane:
     """The plane that would reduce the expected uncertainty most.
 
     Raises:
@@ -123,7 +131,7 @@ def next_plane(catalogue: Catalogue, outcome: Outcome, among: Among) -> NextPlan
     """
     _require_uncertainty(outcome)
     answer = outcome.reconstruction
-    model = _same_model(catalogue, outcome)
+    model = interruptible(_same_model(catalogue, outcome), check)
     return best_plane(model, answer.state.fits[0], answer.mesh, outcome.grid, answer.planes, among)
 
 
@@ -138,6 +146,10 @@ class Posterior:
     model: ShapeModel
     outcome: Outcome
     spacing_mm: float | None
+
+    def checked(self, check: Check) -> "Posterior":
+        """The same, whose evaluations pass a check first."""
+        return replace(self, model=interruptible(self.model, check))
 
     def draw(self, seed: int) -> PosteriorShape:
         """One of them, a pure function of the outcome, the spacing and the seed."""
@@ -204,8 +216,18 @@ def label_map(model: ShapeModel, shape: SampledShape, spacing_mm: float, max_vox
     return Volume((probability >= OCCUPIED).astype(np.uint8), grid)
 
 
+def modes_of(model: ShapeModel, modes: ModeSource, check: Check = unchecked) -> ShapeModes:
+    """The modes of a model by rank."""
+    return modes(interruptible(model, check))
+
+
 def shape_along_modes(
-    model: ShapeModel, modes: ShapeModes, coordinates: Mapping[int, float], spacing_mm: float | None, max_voxels: int
+    model: ShapeModel,
+    modes: ShapeModes,
+    coordinates: Mapping[int, float],
+    spacing_mm: float | None,
+    max_voxels: int,
+    check: Check = unchecked,
 ) -> Mesh:
     """Surface at coordinates (SD) along modes by rank.
 
@@ -215,16 +237,16 @@ def shape_along_modes(
         TooLarge: the evaluated grid would have more voxels than allowed.
     """
     require_step(model, spacing_mm, max_voxels)
-    return shape_along(model, modes, coordinates, spacing_mm)
+    return shape_along(interruptible(model, check), modes, coordinates, spacing_mm)
 
 
-def features(catalogue: Catalogue, outcome: Outcome, modes: ModeSource) -> LatentFeatures:
+def features(catalogue: Catalogue, outcome: Outcome, modes: ModeSource, check: Check = unchecked) -> LatentFeatures:
     """The latent code of an outcome beside the training population's.
 
     Raises:
         NotComputed: the model that made the outcome is no longer loaded.
     """
-    model, state = _same_model(catalogue, outcome), outcome.reconstruction.state
+    model, state = interruptible(_same_model(catalogue, outcome), check), outcome.reconstruction.state
     return latent_features(model, modes(model), state.fits[0], state.covariance)
 
 
@@ -243,9 +265,10 @@ class Way:
     spacing_mm: float | None
     space: Space
 
-    def shape(self, at: float) -> Mesh:
+    def shape(self, at: float, check: Check = unchecked) -> Mesh:
         """Surface at a place, 0 the start and 1 the end; world RAS mm."""
-        return shape_between(self.model, self.start.latent, self.end.latent, self.start.pose, at, self.spacing_mm)
+        model = interruptible(self.model, check)
+        return shape_between(model, self.start.latent, self.end.latent, self.start.pose, at, self.spacing_mm)
 
 
 def way_between(

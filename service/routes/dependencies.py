@@ -4,13 +4,25 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated
 
-from fastapi import Depends, Request
+from fastapi import Depends, Path, Request
 
 from model.bundle import ShapeModel
+from service.errors import UnknownResult
 from service.job_ports import BlobStore, JobEngine
 from service.model_registry import ModelRegistry
 from service.observability import Log, Metrics
-from service.ports import Compute, MaskReader, MeshWriter, ModeSource, ResultStore, Ticket, VolumeWriter, WorkEngine
+from service.ports import (
+    Compute,
+    MaskReader,
+    MeshWriter,
+    ModeSource,
+    ResultStore,
+    StoredResult,
+    Ticket,
+    VolumeWriter,
+    WorkEngine,
+)
+from service.routes.problems import NamedNotFound
 from service.settings import Settings
 
 
@@ -53,8 +65,21 @@ def model_in_path(model: str, services: Annotated[Services, Depends(services_of)
 WithServices = Annotated[Services, Depends(services_of)]
 WithTicket = Annotated[Ticket, Depends(admitted)]
 WithModel = Annotated[ShapeModel, Depends(model_in_path)]
+#: The identifier of a result in a path.
+ResultId = Annotated[
+    str, Path(alias="id", description="identifier of the result", json_schema_extra={"format": "uuid"})
+]
 
 
 def address(request: Request, path: str) -> str:
     """Absolute path of a resource as the client sees it, behind a proxy's prefix."""
     return f"{request.scope.get('root_path', '').rstrip('/')}{path}"
+
+
+def result_of_parameter(services: Services, identifier: str, part: str) -> StoredResult:
+    """The result that a parameter names; a problem that names the parameter otherwise."""
+    try:
+        return services.store.load(identifier)
+    except UnknownResult:
+        sentence = f"The parameter {part} names no reconstruction that is kept; it may have expired or been deleted."
+        raise NamedNotFound(UnknownResult(sentence), part) from None

@@ -1,8 +1,9 @@
 """Meshes to files, with what a reader should know of them."""
 
+from model.bundle import ShapeModel
 from model.geometry import Space
 from model.inference.decimation import decimated
-from service.ports import MeshFormat, StoredResult
+from service.ports import MeshFormat, Outcome, StoredResult
 from service.routes.dependencies import Services
 
 
@@ -19,11 +20,15 @@ def mesh_bytes(
         space: of the coordinates; the input's world when None.
     """
     outcome = result.outcome
-    metadata = model_metadata(outcome.model_name, outcome.model_version, outcome.model_digest)
-    mesh = decimated(outcome.reconstruction.mesh, max_error_mm)
-    return services.write_mesh(mesh, format.value, space=space or outcome.reconstruction.space, metadata=metadata)
+    mesh, world = decimated(outcome.reconstruction.mesh, max_error_mm), space or outcome.reconstruction.space
+    return services.write_mesh(mesh, format.value, space=world, metadata=metadata_of_outcome(outcome))
 
 
-def model_metadata(name: str, version: str, digest: str) -> dict[str, object]:
+def metadata_of_outcome(outcome: Outcome) -> dict[str, object]:
     """What a mesh says of the model that made it."""
-    return {"model": name, "version": version, "digest": digest}
+    return {"model": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest}
+
+
+def metadata_of_model(model: ShapeModel) -> dict[str, object]:
+    """The same of a shape of the model itself."""
+    return {"model": model.manifest.name, "version": model.manifest.version, "digest": model.digest}

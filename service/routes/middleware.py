@@ -16,7 +16,7 @@ from service.routes.problems import internal_error, respond_to
 
 _SAFE_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}\Z")
 #: Open without a key: probes, the page, which asks for one, and the description of the interface.
-OPEN_PATHS = ("/", "/healthz", "/readyz", "/docs", "/redoc", "/openapi.json")
+OPEN_PATHS = ("/", "/healthz", "/readyz", "/docs", "/openapi.json")
 OPEN_PREFIXES = ("/static-offline-docs/", "/page/")
 
 

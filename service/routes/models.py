@@ -6,6 +6,7 @@ from service import use_cases
 from service.presentation import model_description, model_summary
 from service.routes.dependencies import WithModel, WithServices, address
 from service.routes.responses import problems
+from service.routes.strict import StrictRoute
 from service.schemas import ModelDescription, ModelList
 
 PATH = "/v1/models"
@@ -13,10 +14,10 @@ PATH = "/v1/models"
 
 def models_router() -> APIRouter:
     """The routes."""
-    router = APIRouter(prefix=PATH, tags=["models"])
-    router.add_api_route("", list_models, methods=["GET"], summary="The loaded models", responses=problems())
+    router = APIRouter(prefix=PATH, tags=["models"], route_class=StrictRoute)
+    router.add_api_route("", list_models, methods=["GET"], summary="The loaded models", responses=problems(422))
     router.add_api_route(
-        "/{model}", describe_model, methods=["GET"], summary="All about one model", responses=problems(404)
+        "/{model}", describe_model, methods=["GET"], summary="All about one model", responses=problems(404, 422)
     )
     return router
 

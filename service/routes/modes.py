@@ -1,35 +1,46 @@
 """``/v1/models/{model}/modes`` and ``/shape``: what the dimensions of a model move."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request
 from starlette.responses import JSONResponse, Response
 
 from model.bundle import ShapeModel
+from model.interruption import Check
 from service import use_cases
 from service.mode_presentation import mode_list
 from service.mode_schemas import ModeList, ModeMeshQuery, ModeQuery, ShapeQuery, parse_coordinates
-from service.routes.caching import CONDITIONAL, cached, caching_headers, is_held, not_modified
+from service.routes.caching import (
+    CONDITIONAL,
+    cached,
+    caching_headers,
+    confirmed,
+    is_held,
+    names_version,
+    not_modified,
+)
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithModel, WithServices, address
-from service.routes.meshes import model_metadata
+from service.routes.meshes import metadata_of_model
 from service.routes.models import PATH
 from service.routes.responses import MESH_MEDIA_TYPES, Responses, attachment, files, problems
+from service.routes.strict import StrictRoute
 
 Rank = Annotated[int, Path(ge=1, description="of the mode, from 1")]
 
 
 def modes_router() -> APIRouter:
     """The routes."""
-    router = APIRouter(prefix=f"{PATH}/{{model}}", tags=["modes"])
+    router = APIRouter(prefix=f"{PATH}/{{model}}", tags=["modes"], route_class=StrictRoute)
     router.add_api_route(
         "/modes",
         list_modes,
         methods=["GET"],
         response_model=ModeList,
         summary="Modes of shape, by what they move",
-        responses={**cached({"description": "the modes by rank"}), **problems(404, 503)},
+        responses={**cached({"description": "the modes by rank"}, lasting=False), **problems(404, 422, 503)},
         openapi_extra=CONDITIONAL,
     )
     for path, endpoint, summary in (
@@ -50,13 +61,13 @@ def modes_router() -> APIRouter:
 
 async def list_modes(request: Request, model: WithModel, services: WithServices) -> Response:
     """Dimensions of the flow's base, ranked by how far one standard deviation moves the mean surface."""
-    headers = caching_headers(services, model, "modes", address(request, ""))
+    headers = caching_headers(services, model, "modes", address(request, ""), lasting=names_version(request))
     if is_held(request, headers):
         return not_modified(headers)
     with services.engine.admit() as ticket:
-        modes = await run_while_connected(request, ticket, lambda _: services.modes(model))
+        modes = await run_while_connected(request, ticket, partial(use_cases.modes_of, model, services.modes))
     place = address(request, f"{PATH}/{model.manifest.name}/modes")
-    return JSONResponse(mode_list(model, modes, place).model_dump(mode="json"), headers=headers)
+    return confirmed(request, JSONResponse(mode_list(model, modes, place).model_dump(mode="json"), headers=headers))
 
 
 async def read_mode(
@@ -88,23 +99,26 @@ async def _mesh(
     query: ModeMeshQuery,
 ) -> Response:
     where = sorted(coordinates.items())
-    headers = caching_headers(services, model, "shape", where, query.format.value, query.spacing_mm)
+    asked = where, query.format.value, query.spacing_mm
+    headers = caching_headers(services, model, "shape", *asked, lasting=names_version(request))
     if is_held(request, headers):
         return not_modified(headers)
     with services.engine.admit() as ticket:
-        data = await run_while_connected(request, ticket, lambda _: _bytes(services, model, coordinates, query))
-    name = f"{model.manifest.name}-shape.{query.format.value}"
-    return Response(data, media_type=MESH_MEDIA_TYPES[query.format], headers=headers | attachment(name))
+        data = await run_while_connected(request, ticket, partial(_bytes, services, model, coordinates, query))
+    headers |= attachment(f"{model.manifest.name}-shape.{query.format.value}")
+    return confirmed(request, Response(data, media_type=MESH_MEDIA_TYPES[query.format], headers=headers))
 
 
-def _bytes(services: Services, model: ShapeModel, coordinates: Mapping[int, float], query: ModeMeshQuery) -> bytes:
+def _bytes(
+    services: Services, model: ShapeModel, coordinates: Mapping[int, float], query: ModeMeshQuery, check: Check
+) -> bytes:
     limit = services.settings.max_voxels
-    mesh = use_cases.shape_along_modes(model, services.modes(model), coordinates, query.spacing_mm, limit)
-    manifest = model.manifest
-    said = model_metadata(manifest.name, manifest.version, model.digest)
+    modes = use_cases.modes_of(model, services.modes, check)
+    mesh = use_cases.shape_along_modes(model, modes, coordinates, query.spacing_mm, limit, check)
     where = " ".join(f"{rank}:{sd:g}" for rank, sd in sorted(coordinates.items()))
-    return services.write_mesh(mesh, query.format.value, space=manifest.frame, metadata={**said, "modes": where})
+    metadata = {**metadata_of_model(model), "modes": where}
+    return services.write_mesh(mesh, query.format.value, space=model.manifest.frame, metadata=metadata)
 
 
 def _cached_mesh() -> Responses:
-    return cached(files(MESH_MEDIA_TYPES.values(), "the surface in the model's canonical frame, mm"))
+    return cached(files(MESH_MEDIA_TYPES.values(), "the surface in the model's canonical frame, mm"), lasting=False)

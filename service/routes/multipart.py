@@ -1,12 +1,66 @@
-"""The one kind of body that requests have."""
+"""The one kind of body that requests have, read as a whole or refused."""
 
 from fastapi import Request
+from python_multipart.multipart import parse_options_header
+from starlette.datastructures import FormData
+from starlette.requests import ClientDisconnect
+from starlette.types import Message
 
-from service.errors import UnsupportedMediaType
+from service.errors import Abandoned, UnsupportedMediaType
+from service.routes.problems import MalformedBody
+
+MEDIA_TYPE = b"multipart/form-data"
+CUT_OFF = (
+    "The request's body is cut off: the boundary that closes multipart/form-data (--BOUNDARY--) is missing; send the "
+    "whole body."
+)
 
 
-def require_multipart(request: Request) -> None:
-    """Refuse other bodies: `UnsupportedMediaType`."""
-    media = request.headers.get("content-type", "").split(";")[0].strip().lower()
-    if media != "multipart/form-data":
+def with_whole_body(request: Request) -> Request:
+    """The same request, whose body has to be whole.
+
+    Raises:
+        UnsupportedMediaType: the body is of another kind.
+        MalformedBody: while the body is read, when it ends before its last boundary.
+    """
+    media, options = parse_options_header(request.headers.get("content-type", ""))
+    if media != MEDIA_TYPE:
         raise UnsupportedMediaType("The request's body must be multipart/form-data; the interface names its parts.")
+    boundary = options.get(b"boundary")
+    return request if boundary is None else Request(request.scope, _Whole(request, boundary).receive)
+
+
+async def read_form(request: Request) -> FormData:
+    """The parts of a body; the request keeps them for whoever asks again.
+
+    Raises:
+        Abandoned: the client went away first.
+    """
+    try:
+        return await request.form()
+    except ClientDisconnect:
+        raise Abandoned("The client went away before its request was read.") from None
+
+
+class _Whole:
+    """Messages of a body, which must hold the boundary that closes it (RFC 2046, 5.1.1).
+
+    The reader of forms takes what it has when a body ends early, so that a request without its last parts would look
+    like one that never had them.
+    """
+
+    def __init__(self, request: Request, boundary: bytes) -> None:
+        self._receive = request.receive
+        self._closing = b"\r\n--" + boundary + b"--"
+        self._last = b"\r\n"
+        self._closed = False
+
+    async def receive(self) -> Message:
+        message = await self._receive()
+        if message["type"] == "http.request" and not self._closed:
+            seen = self._last + message.get("body", b"")
+            self._closed = self._closing in seen
+            self._last = seen[1 - len(self._closing) :]
+            if not self._closed and not message.get("more_body", False):
+                raise MalformedBody(CUT_OFF)
+        return message

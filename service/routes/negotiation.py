@@ -6,6 +6,9 @@ from starlette.datastructures import Headers
 
 from service.errors import NotAcceptable
 
+#: In place of tags: any of them.
+ANY = "*"
+
 
 def listed(headers: Headers, name: str) -> str | None:
     """Value of a header that holds a list, its lines joined as if they were one; None when it is not there."""
@@ -28,12 +31,9 @@ def negotiate(accept: str | None, offered: Sequence[str]) -> str:
     return best
 
 
-def matches_etag(if_none_match: str | None, etag: str) -> bool:
-    """Whether the client holds this version already (weak comparison)."""
-    if if_none_match is None:
-        return False
-    tags = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]
-    return "*" in tags or etag in tags
+def etags_of(if_none_match: str | None) -> frozenset[str]:
+    """The tags that the client holds, to be compared weakly; `ANY` stands for whatever there is."""
+    return frozenset(tag.strip().removeprefix("W/") for tag in (if_none_match or "").split(","))
 
 
 def _parse_range(text: str) -> tuple[str, float]:

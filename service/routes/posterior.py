@@ -1,32 +1,30 @@
 """``/v1/reconstructions/{id}``: what else the shape could be, and where to draw to know better."""
 
-from collections.abc import AsyncIterator
 from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
-from starlette.responses import JSONResponse, Response, StreamingResponse
-from zipstream import ZipStream  # type: ignore[import-untyped]
+from starlette.responses import JSONResponse, Response
 
+from model.interruption import Check
 from service import use_cases
 from service.adapters.posterior_files import PosteriorWriter
-from service.adapters.sample_files import MANIFEST
-from service.ports import Ticket
+from service.adapters.sample_files import MANIFEST, SampleFile
 from service.presentation import next_plane_summary
 from service.request_schemas import NextPlaneQuery, PosteriorQuery
+from service.routes.archives import ArchiveResponse
 from service.routes.connection import run_while_connected
-from service.routes.dependencies import WithServices, WithTicket
+from service.routes.dependencies import ResultId, WithServices, WithTicket
 from service.routes.reconstructions import PATH
-from service.routes.responses import ZIP, attachment, files, problems
-from service.routes.results import Identifier
+from service.routes.responses import ZIP, files, problems
+from service.routes.strict import StrictRoute
 from service.schemas import NextPlaneSchema
-from service.use_cases import Posterior
 
 
 def posterior_router() -> APIRouter:
     """The routes."""
-    router = APIRouter(prefix=f"{PATH}/{{id}}", tags=["reconstructions"])
+    router = APIRouter(prefix=f"{PATH}/{{id}}", tags=["reconstructions"], route_class=StrictRoute)
     router.add_api_route(
         "/posterior",
         read_posterior,
@@ -50,7 +48,7 @@ def posterior_router() -> APIRouter:
 
 
 async def read_posterior(
-    identifier: Identifier, query: Annotated[PosteriorQuery, Query()], services: WithServices, ticket: WithTicket
+    identifier: ResultId, query: Annotated[PosteriorQuery, Query()], services: WithServices, ticket: WithTicket
 ) -> Response:
     """Draws of code, pose and discrepancy; of an ensemble its members. Item i is the shape of `seed` + i."""
     limits = services.settings
@@ -58,29 +56,17 @@ async def read_posterior(
     result = await run_in_threadpool(services.store.load, identifier)
     posterior = use_cases.posterior(services.registry, result.outcome, query.spacing_mm, limits.max_voxels)
     writer = PosteriorWriter(services.write_mesh, query.format)
-    chunks = _zip_chunks(posterior, seeds, writer, identifier, ticket)
-    return StreamingResponse(chunks, media_type=ZIP, headers=attachment("posterior.zip"))
 
+    def made(check: Check, seed: int) -> SampleFile:
+        return writer.make(posterior.checked(check), seed)
 
-async def _zip_chunks(
-    posterior: Posterior, seeds: range, writer: PosteriorWriter, identifier: str, ticket: Ticket
-) -> AsyncIterator[bytes]:
-    archive = ZipStream(sized=False)
-    entries = []
-    for seed in seeds:
-        file = await ticket.run(partial(writer.make, posterior, seed))
-        entries.append(file.entry)
-        if file.data:
-            archive.add(file.data, file.name)
-        for chunk in archive.all_files():
-            yield chunk
-    archive.add(writer.manifest(posterior, identifier, entries), MANIFEST)
-    for chunk in archive.finalize():
-        yield chunk
+    works = (partial(made, seed=seed) for seed in seeds)
+    manifest = partial(writer.manifest, posterior, identifier)
+    return ArchiveResponse("posterior.zip", ticket, works, manifest, limits.workers + 1)
 
 
 async def read_next_plane(
-    identifier: Identifier,
+    identifier: ResultId,
     query: Annotated[NextPlaneQuery, Query()],
     request: Request,
     services: WithServices,
@@ -88,7 +74,6 @@ async def read_next_plane(
 ) -> JSONResponse:
     """The plane whose drawing would reduce the expected uncertainty of the surface most, and by how much."""
     result = await run_in_threadpool(services.store.load, identifier)
-    found = await run_while_connected(
-        request, ticket, lambda _: use_cases.next_plane(services.registry, result.outcome, query.planes)
-    )
+    work = partial(use_cases.next_plane, services.registry, result.outcome, query.planes)
+    found = await run_while_connected(request, ticket, work)
     return JSONResponse(next_plane_summary(result.outcome, found).model_dump(mode="json"))

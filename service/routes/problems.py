@@ -5,13 +5,12 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel
 from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Match, Mount
 
-from model.errors import InputError, InvalidParameter, MorphoFlowError, TooLarge
+from model.errors import InputError, InvalidParameter, MorphoFlowError, NotFound, TooLarge
 from service.errors import PROTOCOL_KINDS, HelperLost, Kind, Overloaded, Unauthorised, kind_of
 from service.schemas import Problem
 
@@ -30,6 +29,22 @@ PROTOCOL_SENTENCES = {
 }
 
 
+class MalformedBody(HTTPException):
+    """A body that cannot be read, and a sentence that may be told."""
+
+    def __init__(self, sentence: str) -> None:
+        super().__init__(400, sentence)
+
+
+class NamedNotFound(HTTPException):
+    """What a parameter names is not here; a problem of the error's kind that names the parameter."""
+
+    def __init__(self, error: NotFound, part: str) -> None:
+        super().__init__(404)
+        self.error = error
+        self.part = part
+
+
 def problem_response(
     kind: Kind, detail: str, *, request_id: str | None, part: str | None = None, headers: dict[str, str] | None = None
 ) -> Response:
@@ -41,11 +56,13 @@ def problem_response(
     return JSONResponse(content, kind.status, headers=headers, media_type=PROBLEM_MEDIA_TYPE)
 
 
-def respond_to(error: MorphoFlowError, *, request_id: str | None, retry_after_s: int) -> Response:
+def respond_to(
+    error: MorphoFlowError, *, request_id: str | None, retry_after_s: int, part: str | None = None
+) -> Response:
     """The response to one of the project's own errors."""
     kind = kind_of(error)
     detail = str(error) if kind.status != 500 else PROTOCOL_SENTENCES[500]
-    part = error.part if isinstance(error, InputError) else None
+    part = error.part if isinstance(error, InputError) else part
     return problem_response(kind, detail, request_id=request_id, part=part, headers=_headers(error, retry_after_s))
 
 
@@ -81,6 +98,8 @@ def internal_error(request_id: str) -> Response:
 def _protocol(request: Request, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
         raise error
+    if isinstance(error, NamedNotFound):
+        return respond_to(error.error, request_id=request_id_of(request), retry_after_s=0, part=error.part)
     limit = _multipart_limit(error.detail) if error.status_code == 400 else None
     if limit is not None:
         return respond_to(limit, request_id=request_id_of(request), retry_after_s=0)
@@ -88,7 +107,8 @@ def _protocol(request: Request, error: Exception) -> Response:
     headers = dict(error.headers) if error.headers else {}
     if kind.status == 405:
         headers["Allow"] = ", ".join(allowed_methods(request))
-    return problem_response(kind, PROTOCOL_SENTENCES[kind.status], request_id=request_id_of(request), headers=headers)
+    sentence = error.detail if isinstance(error, MalformedBody) else PROTOCOL_SENTENCES[kind.status]
+    return problem_response(kind, sentence, request_id=request_id_of(request), headers=headers)
 
 
 def _multipart_limit(said: str) -> TooLarge | None:
@@ -114,18 +134,16 @@ async def _invalid(request: Request, error: Exception) -> Response:
     if not isinstance(error, RequestValidationError):
         raise error
     first = error.errors()[0]
-    part, sentence = _sentence(request, first)
+    part, sentence = _sentence(first)
     return problem_response(
         kind_of(InvalidParameter("", part=part)), sentence, request_id=request_id_of(request), part=part
     )
 
 
-def _sentence(request: Request, fault: dict[str, Any]) -> tuple[str, str]:
+def _sentence(fault: dict[str, Any]) -> tuple[str, str]:
     names = [str(item) for item in fault["loc"][1:]] or ["body"]
     part = names[0] if len(names) == 1 else f"{names[0]}[{names[1]}]"
     match fault["type"]:
-        case "extra_forbidden":
-            return part, f"There is no such parameter; accepted are: {', '.join(accepted_names(request))}."
         case "missing":
             return part, f"The parameter {part} is missing."
         case "value_error" if "UploadFile" in fault["msg"]:
@@ -135,15 +153,6 @@ def _sentence(request: Request, fault: dict[str, Any]) -> tuple[str, str]:
         case _:
             reason = str(fault["msg"]).removeprefix("Value error, ")
             return part, f"The parameter {part} is not valid: {reason[:1].lower()}{reason[1:]}."
-
-
-def accepted_names(request: Request) -> list[str]:
-    """Names of the parameters that the route of a request takes in its query or form."""
-    dependant = getattr(request.scope.get("route"), "dependant", None)
-    parameters = [*dependant.body_params, *dependant.query_params] if dependant else []
-    annotations = [parameter.field_info.annotation for parameter in parameters]
-    models = [item for item in annotations if isinstance(item, type) and issubclass(item, BaseModel)]
-    return [name for model in models for name in model.model_fields]
 
 
 def _headers(error: MorphoFlowError, retry_after_s: int) -> dict[str, str] | None:

@@ -8,10 +8,9 @@ from fastapi.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from model.errors import InvalidParameter, TooLarge, UnknownModel
-from model.inference.observations import MaskStack
-from model.inference.reconstruction import Watch
 from model.inference.stacks import checked_labels
 from model.inference.surface import require_step
+from model.interruption import Check
 from service import use_cases
 from service.adapters.images import image_format
 from service.job_submission import require_stacks
@@ -27,12 +26,14 @@ from service.routes.job_requests import (
     accepted_job,
     submit,
     submittable_model,
+    turns_of,
     wants_job,
 )
+from service.routes.masks import read_stacks
 from service.routes.meshes import mesh_bytes
-from service.routes.multipart import require_multipart
 from service.routes.negotiation import listed, negotiate
 from service.routes.responses import DIRECT_FORMATS, JSON, MESH_MEDIA_TYPES, attachment, files, problems
+from service.routes.strict import StrictRoute
 from service.schemas import ResultSummary
 
 PATH = "/v1/reconstructions"
@@ -46,14 +47,13 @@ def accepted_format(request: Request) -> MeshFormat | None:
 
 def reconstructions_router() -> APIRouter:
     """The route."""
-    router = APIRouter(tags=["reconstructions"])
+    router = APIRouter(tags=["reconstructions"], route_class=StrictRoute)
     router.add_api_route(
         PATH,
         create_reconstruction,
         methods=["POST"],
         status_code=201,
         response_model=ResultSummary,
-        dependencies=[Depends(require_multipart)],
         summary="Reconstruct a surface from sparse masks",
         responses={
             201: {
@@ -96,9 +96,9 @@ async def create_reconstruction(
     if len(form.mask) > services.settings.max_masks:
         raise TooLarge(f"At most {services.settings.max_masks} parts named mask are accepted.", part="mask")
     if as_job:
-        return await run_in_threadpool(_enqueue, request, services, form, key)
+        return await turns_of(request).run(_enqueue, request, services, form, key)
     with services.engine.admit() as ticket:
-        result = await run_while_connected(request, ticket, lambda watch: _reconstruct(services, form, watch))
+        result = await run_while_connected(request, ticket, partial(_reconstruct, services, form))
     return await run_in_threadpool(_answer, request, services, result, wanted)
 
 
@@ -115,34 +115,23 @@ def _enqueue(request: Request, services: Services, form: ReconstructionForm, key
     return accepted_job(request, submit(services, RECONSTRUCTION_JOB, argument, inputs, key))
 
 
-def _reconstruct(services: Services, form: ReconstructionForm, watch: Watch) -> StoredResult:
+def _reconstruct(services: Services, form: ReconstructionForm, check: Check) -> StoredResult:
     options, labels = form.options(), parse_labels(form.label)
     max_voxels = services.settings.max_voxels
     try:
         model = services.registry.get(form.model)
     except UnknownModel as error:
         raise InvalidParameter(str(error), part="model") from None
-    stacks = _read_stacks(services, form, labels, watch)
+    stacks = read_stacks(services, form.mask, labels, check)
     timer = StageTimer(services.metrics.stages)
 
     def observed(stage: str) -> None:
-        watch(stage)
+        check()
         timer(stage)
 
-    check = partial(watch, "evaluation")
     outcome = services.compute(use_cases.reconstruct, model, stacks, options, max_voxels, watch=observed, check=check)
     timer.finish()
     return services.store.save(outcome)
-
-
-def _read_stacks(
-    services: Services, form: ReconstructionForm, labels: frozenset[int] | None, watch: Watch
-) -> tuple[MaskStack, ...]:
-    stacks: list[MaskStack] = []
-    for number, mask in enumerate(form.mask):
-        watch("masks")
-        stacks += services.read_mask(mask.file, f"mask[{number}]", labels)
-    return tuple(stacks)
 
 
 def _answer(request: Request, services: Services, result: StoredResult, wanted: MeshFormat | None) -> Response:

@@ -1,39 +1,38 @@
 """``/v1/reconstructions/{id}``: a kept result and its parts."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
+from model.errors import InvalidParameter
+from model.interruption import Check
 from service import use_cases
-from service.ports import StoredResult
 from service.presentation import result_summary
 from service.request_schemas import MeshQuery, UncertaintyQuery, VolumeQuery
 from service.routes.connection import run_while_connected
-from service.routes.dependencies import Services, WithServices, WithTicket, address
+from service.routes.dependencies import ResultId, Services, WithServices, WithTicket, address
 from service.routes.meshes import mesh_bytes
 from service.routes.reconstructions import PATH
 from service.routes.responses import JSON, MESH_MEDIA_TYPES, NIFTI, Responses, attachment, files, problems
+from service.routes.strict import StrictRoute
 from service.schemas import ResultSummary, SurfaceSd
 from service.use_cases import Volume
-
-Identifier = Annotated[
-    str, Path(alias="id", description="identifier of the result", json_schema_extra={"format": "uuid"})
-]
 
 
 def results_router() -> APIRouter:
     """The routes."""
-    router = APIRouter(prefix=f"{PATH}/{{id}}", tags=["reconstructions"])
+    router = APIRouter(prefix=f"{PATH}/{{id}}", tags=["reconstructions"], route_class=StrictRoute)
     router.add_api_route(
         "",
         read_summary,
         methods=["GET"],
         response_model=ResultSummary,
         summary="Summary of a result",
-        responses=problems(404),
+        responses=problems(404, 422),
     )
     router.add_api_route(
         "",
@@ -41,7 +40,7 @@ def results_router() -> APIRouter:
         methods=["DELETE"],
         status_code=204,
         summary="Forget a result at once",
-        responses={204: {"description": "it is gone"}, **problems(404)},
+        responses={204: {"description": "it is gone"}, **problems(404, 422)},
     )
     router.add_api_route(
         "/mesh",
@@ -49,7 +48,10 @@ def results_router() -> APIRouter:
         methods=["GET"],
         response_class=Response,
         summary="Surface of a result",
-        responses={200: files(MESH_MEDIA_TYPES.values(), "the surface in the input's world, mm"), **problems(404, 422)},
+        responses={
+            200: files(MESH_MEDIA_TYPES.values(), "the surface in the input's world, mm"),
+            **problems(404, 422, 503),
+        },
     )
     nifti = files([NIFTI], "a gzipped NIfTI file (.nii.gz)")
     _add_volume(router, "/segmentation", read_segmentation, "Dense label map", {200: nifti})
@@ -71,27 +73,41 @@ def _add_volume(router: APIRouter, path: str, endpoint: Callable[..., object], s
     )
 
 
-def read_summary(identifier: Identifier, request: Request, services: WithServices) -> JSONResponse:
+def read_summary(identifier: ResultId, request: Request, services: WithServices) -> JSONResponse:
     """Figures of a result, and where its parts are."""
     result = services.store.load(identifier)
     return JSONResponse(result_summary(result, address(request, f"{PATH}/{identifier}")).model_dump(mode="json"))
 
 
-def delete_result(identifier: Identifier, services: WithServices) -> Response:
+def delete_result(identifier: ResultId, services: WithServices) -> Response:
     """Its parts can no longer be read after this."""
     services.store.delete(identifier)
     return Response(status_code=204)
 
 
-def read_mesh(identifier: Identifier, query: Annotated[MeshQuery, Query()], services: WithServices) -> Response:
-    """The watertight surface in the input's world or in `space`, mm; the file says which where its format can."""
-    data = mesh_bytes(services, services.store.load(identifier), query.format, query.max_error_mm, query.space)
+async def read_mesh(
+    identifier: ResultId, query: Annotated[MeshQuery, Query()], request: Request, services: WithServices
+) -> Response:
+    """The watertight surface in the input's world or in `space`, mm; the file says which where its format can.
+
+    As it is kept it can be had while too much work waits; fewer triangles are work like any other.
+    """
+    if query.max_error_mm == 0:
+        return await run_in_threadpool(_mesh, services, identifier, query)
+    with services.engine.admit() as ticket:
+        return await run_while_connected(request, ticket, partial(_mesh, services, identifier, query))
+
+
+def _mesh(services: Services, identifier: str, query: MeshQuery, check: Check = use_cases.unchecked) -> Response:
+    result = services.store.load(identifier)
+    check()
+    data = mesh_bytes(services, result, query.format, query.max_error_mm, query.space)
     headers = attachment(f"reconstruction.{query.format.value}")
     return Response(data, media_type=MESH_MEDIA_TYPES[query.format], headers=headers)
 
 
 async def read_segmentation(
-    identifier: Identifier,
+    identifier: ResultId,
     query: Annotated[VolumeQuery, Query()],
     request: Request,
     services: WithServices,
@@ -99,12 +115,12 @@ async def read_segmentation(
 ) -> Response:
     """A label map on the input's grid, or on a grid of its own at `spacing_mm`; 1 is the object."""
     return await run_while_connected(
-        request, ticket, lambda _: _nifti(services, identifier, query, use_cases.segmentation, "segmentation")
+        request, ticket, partial(_nifti, services, identifier, query, use_cases.segmentation, "segmentation")
     )
 
 
 async def read_occupancy(
-    identifier: Identifier,
+    identifier: ResultId,
     query: Annotated[VolumeQuery, Query()],
     request: Request,
     services: WithServices,
@@ -112,12 +128,12 @@ async def read_occupancy(
 ) -> Response:
     """The probability that a voxel lies in the object, 0 to 1."""
     return await run_while_connected(
-        request, ticket, lambda _: _nifti(services, identifier, query, use_cases.probability_map, "occupancy")
+        request, ticket, partial(_nifti, services, identifier, query, use_cases.probability_map, "occupancy")
     )
 
 
 async def read_uncertainty(
-    identifier: Identifier,
+    identifier: ResultId,
     query: Annotated[UncertaintyQuery, Query()],
     request: Request,
     services: WithServices,
@@ -125,9 +141,14 @@ async def read_uncertainty(
 ) -> Response:
     """Voxel entropy in nats, 0 to ln 2; with `kind=surface_sd` mm at each vertex of the mesh in PLY."""
     if query.kind == "surface_sd":
+        if query.spacing_mm is not None:
+            sentence = (
+                "The parameter spacing_mm is of no use with kind=surface_sd, which tells of vertices, not voxels."
+            )
+            raise InvalidParameter(sentence, part="spacing_mm")
         return await run_in_threadpool(_surface_sd, services, identifier)
     return await run_while_connected(
-        request, ticket, lambda _: _nifti(services, identifier, query, use_cases.entropy_map, "entropy")
+        request, ticket, partial(_nifti, services, identifier, query, use_cases.entropy_map, "entropy")
     )
 
 
@@ -139,9 +160,15 @@ def _surface_sd(services: Services, identifier: str) -> Response:
 
 
 def _nifti(
-    services: Services, identifier: str, query: VolumeQuery, compute: Callable[..., Volume], description: str
+    services: Services,
+    identifier: str,
+    query: VolumeQuery,
+    compute: Callable[..., Volume],
+    description: str,
+    check: Check,
 ) -> Response:
-    result: StoredResult = services.store.load(identifier)
-    volume = compute(services.registry, result.outcome, query.spacing_mm, services.settings.max_voxels)
+    outcome, limit = services.store.load(identifier).outcome, services.settings.max_voxels
+    volume = compute(services.registry, outcome, query.spacing_mm, limit, check)
+    check()
     data = services.write_volume(volume.array, volume.grid, description)
     return Response(data, media_type=NIFTI, headers=attachment(f"{description}.nii.gz"))

@@ -1,31 +1,29 @@
 """``/v1/models/{model}/samples``: synthetic shapes, one or a ZIP that streams while it is made."""
 
-from collections.abc import AsyncIterator, Callable, Iterable
-from contextlib import aclosing
 from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request
-from starlette.responses import Response, StreamingResponse
-from zipstream import ZipStream  # type: ignore[import-untyped]
+from starlette.responses import Response
 
-from model.bundle import ShapeModel
-from model.inference.reconstruction import Watch
 from model.inference.surface import require_step
+from model.interruption import Check
 from service import use_cases
 from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, make_sample, manifest_bytes
-from service.ports import SampleFormat, Ticket
+from service.ports import SampleFormat
 from service.request_schemas import BatchQuery, SampleQuery, Seed
-from service.routes.caching import CONDITIONAL, cached, caching_headers, is_held, not_modified
-from service.routes.connection import in_order, run_while_connected
+from service.routes.archives import ArchiveResponse
+from service.routes.caching import CONDITIONAL, cached, caching_headers, confirmed, is_held, not_modified
+from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithModel, WithServices, WithTicket
 from service.routes.models import PATH
 from service.routes.responses import ZIP, attachment, files, problems, sample_media_type
+from service.routes.strict import StrictRoute
 
 
 def samples_router() -> APIRouter:
     """The routes."""
-    router = APIRouter(prefix=f"{PATH}/{{model}}/samples", tags=["samples"])
+    router = APIRouter(prefix=f"{PATH}/{{model}}/samples", tags=["samples"], route_class=StrictRoute)
     router.add_api_route(
         "",
         read_batch,
@@ -41,7 +39,10 @@ def samples_router() -> APIRouter:
         response_class=Response,
         summary="One synthetic shape",
         responses={
-            **cached(files(map(sample_media_type, SampleFormat), "the shape in the model's canonical frame, mm")),
+            **cached(
+                files(map(sample_media_type, SampleFormat), "the shape in the model's canonical frame, mm"),
+                lasting=True,
+            ),
             **problems(404, 413, 422, 503),
         },
         openapi_extra=CONDITIONAL,
@@ -56,18 +57,22 @@ async def read_sample(
     model: WithModel,
     services: WithServices,
 ) -> Response:
-    """A pure function of the model's digest, the seed and the query: cacheable for ever."""
-    headers = caching_headers(services, model, "sample", seed, query)
+    """A pure function of the model's digest, the seed and the query: cacheable for ever.
+
+    Name the model with its version where a cache must not give the shape of an older one.
+    """
+    headers = caching_headers(services, model, "sample", seed, query, lasting=True)
     if is_held(request, headers):
         return not_modified(headers)
     how, writer = _draw(services, query), SampleWriter(services.write_mesh, services.write_volume)
 
-    def made(watch: Watch) -> SampleFile:
-        return services.compute(make_sample, model, writer, seed, how, check=partial(watch, "evaluation"))
+    def made(check: Check) -> SampleFile:
+        return services.compute(make_sample, model, writer, seed, how, check=check)
 
     with services.engine.admit() as ticket:
         file = await run_while_connected(request, ticket, made)
-    return Response(file.data, media_type=sample_media_type(query.format), headers=headers | attachment(file.name))
+    headers |= attachment(file.name)
+    return confirmed(request, Response(file.data, media_type=sample_media_type(query.format), headers=headers))
 
 
 async def read_batch(
@@ -80,25 +85,13 @@ async def read_batch(
     how = _draw(services, query)
     require_step(model, how.spacing_mm, how.max_voxels)
     writer = SampleWriter(services.write_mesh, services.write_volume)
-    works = (partial(services.compute, make_sample, model, writer, seed, how) for seed in seeds)
-    chunks = _zip_chunks(model, how, works, ticket, services.settings.workers + 1)
-    return StreamingResponse(chunks, media_type=ZIP, headers=attachment(f"{model.manifest.name}-samples.zip"))
 
+    def made(check: Check, seed: int) -> SampleFile:
+        return services.compute(make_sample, model, writer, seed, how, check=check)
 
-async def _zip_chunks(
-    model: ShapeModel, how: Draw, works: Iterable[Callable[[], SampleFile]], ticket: Ticket, ahead: int
-) -> AsyncIterator[bytes]:
-    archive = ZipStream(sized=False)
-    entries = []
-    async with aclosing(in_order(ticket, works, ahead)) as made:
-        async for file in made:
-            entries.append(file.entry)
-            archive.add(file.data, file.name)
-            for chunk in archive.all_files():
-                yield chunk
-    archive.add(manifest_bytes(model, how, entries), MANIFEST)
-    for chunk in archive.finalize():
-        yield chunk
+    works = (partial(made, seed=seed) for seed in seeds)
+    manifest = partial(manifest_bytes, model, how)
+    return ArchiveResponse(f"{model.manifest.name}-samples.zip", ticket, works, manifest, limits.workers + 1)
 
 
 def _draw(services: Services, query: SampleQuery) -> Draw:

@@ -39,7 +39,7 @@ class Interface:
 
 @pytest.fixture(scope="module")
 def interface(tmp_path_factory):
-    with running(app_for(tmp_path_factory.mktemp("contract"), max_samples=2, max_voxels=100_000)) as client:
+    with running(app_for(tmp_path_factory.mktemp("contract"), max_samples=2, max_voxels=120_000)) as client:
         result = client.post("/v1/reconstructions", files=mask_parts()).json()["id"]
         yield Interface(schemathesis.openapi.from_url(f"{client.base_url}/openapi.json"), result)
 

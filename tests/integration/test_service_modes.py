@@ -1,15 +1,18 @@
-"""Modes over HTTP: ranked, cacheable for ever, surfaces with what moves them at each vertex."""
+"""Modes over HTTP: ranked, cacheable, surfaces with what moves them at each vertex."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 
+from service.app import create_app
+from service.model_registry import ModelRegistry, pinned_name
 from service.ports import MeshFormat
 from service.routes.responses import MESH_MEDIA_TYPES
-from tests.analytic_model import MEAN_AXES, SPREAD
-from tests.service_parts import NAME, app_for, running
+from tests.analytic_model import MEAN_AXES, SPREAD, ellipsoid_model
+from tests.service_parts import NAME, app_for, running, settings_for
 
 PLACE = f"/v1/models/{NAME}"
 
@@ -83,10 +86,54 @@ def test_who_has_it_gets_no_second_one(client, path):
     first = client.get(f"{PLACE}/{path}")
     tag = first.headers["etag"]
     assert not tag.startswith("W/")
-    assert "immutable" in first.headers["cache-control"]
+    assert first.headers["cache-control"] == "public, no-cache"
     again = client.get(f"{PLACE}/{path}", headers={"If-None-Match": tag})
     assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
     assert client.get(f"{PLACE}/{path}").content == first.content
+
+
+@pytest.mark.parametrize("path", ["modes", "modes/2?sd=-1", "shape?mode=1:1&mode=2:2"])
+def test_only_an_address_with_a_version_is_the_same_for_ever(client, path):
+    version = client.get(f"/v1/models/{NAME}").json()["version"]
+    newest, pinned = client.get(f"{PLACE}/{path}"), client.get(f"{PLACE}@{version}/{path}")
+    assert pinned.headers["cache-control"] == "public, max-age=31536000, immutable"
+    assert (pinned.headers["etag"], pinned.content) == (newest.headers["etag"], newest.content)
+    again = client.get(f"{PLACE}@{version}/{path}", headers={"If-None-Match": newest.headers["etag"]})
+    assert (again.status_code, again.headers["cache-control"]) == (304, pinned.headers["cache-control"])
+
+
+def test_a_newer_model_takes_over_where_no_version_is_named(tmp_path):
+    older, newer = ellipsoid_model(NAME), ellipsoid_model(NAME, (10.0, 10.0, 10.0))
+    newer = replace(newer, manifest=replace(newer.manifest, version="2.0.0"))
+    there = [older]
+    registry = ModelRegistry(
+        {pinned_name(older): older}, (), lambda: ModelRegistry({pinned_name(model): model for model in there})
+    )
+    with running(create_app(settings_for(tmp_path), registry=registry)) as client:
+        before = client.get(f"{PLACE}/shape")
+        there.append(newer)
+        registry.refresh()
+        held = {"If-None-Match": before.headers["etag"]}
+        assert client.get(f"{PLACE}/shape", headers=held).status_code == 200
+        assert client.get(f"{PLACE}@1.0.0/shape", headers=held).status_code == 304
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("modes", 304),
+        ("modes/1", 304),
+        ("modes/99", 404),
+        ("shape?mode=99:1", 404),
+        ("samples/1", 304),
+        ("samples/1?spacing_mm=0.25", 413),
+    ],
+)
+def test_any_copy_is_confirmed_of_what_there_is(tmp_path, path, status):
+    with running(app_for(tmp_path, max_voxels=200_000)) as client:
+        answer = client.get(f"{PLACE}/{path}", headers={"If-None-Match": "*"})
+        assert answer.status_code == status
+        assert status != 304 or answer.headers["etag"] == client.get(f"{PLACE}/{path}").headers["etag"]
 
 
 def test_whatever_changes_the_surface_changes_its_etag(client):

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from model.errors import InvalidParameter, TooLarge
 from model.inference.surface import canonical_box
-from model.inference.surface import canonical_box
 from service import use_cases
 from service.errors import NotComputed
 from service.model_registry import ModelRegistry

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.errors import NotAcceptable
-from service.routes.negotiation import matches_etag, negotiate
+from service.routes.negotiation import ANY, etags_of, negotiate
 
 OFFERED = ("application/json", "model/stl", "model/obj")
 
@@ -46,7 +46,11 @@ def test_any_header_is_answered_or_refused(accept):
 
 @pytest.mark.parametrize(
     ("header", "matches"),
-    [(None, False), ('"a"', True), ('W/"a"', True), ('"b", "a"', True), ("*", True), ('"b"', False)],
+    [(None, False), ('"a"', True), ('W/"a"', True), ('"b", "a"', True), ("*", False), ('"b"', False)],
 )
 def test_etags_are_compared_weakly(header, matches):
-    assert matches_etag(header, '"a"') is matches
+    assert ('"a"' in etags_of(header)) is matches
+
+
+def test_any_etag_is_none_in_particular():
+    assert etags_of("*") == {ANY}
