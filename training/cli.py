@@ -108,7 +108,7 @@ def train(
             objective,
             regime,
             latent_size,
-            known=source.cohort is not None,
+            known=source.states_side,
             reflect=reflect,
             flow=flow,
             ard=ard,

@@ -34,7 +34,7 @@ def configured_for(
     """The configuration that the options describe, with batches and steps for the size of the cohort.
 
     Args:
-        known: whether the cohort is a public one, of which it is known whether there are sides.
+        known: whether it is known of which sides the shapes are.
         reflect: whether mirror images join; where a known cohort has no sides, when None, but not in the paper's
             objective.
         flow, ard, ard_weight: see `training.choices.configured`.

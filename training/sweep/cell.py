@@ -114,7 +114,7 @@ def run_cell(
     """Bring a cell to its result, from wherever an earlier attempt left it.
 
     Args:
-        known: whether the cohort is a public one, see `training.configuring`.
+        known: whether it is known of which sides the shapes are, see `training.configuring`.
     """
     begin = time.perf_counter()
     if not place.is_exported:

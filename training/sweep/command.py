@@ -10,9 +10,9 @@ import typer
 
 from model.errors import InvalidParameter
 from training.choices import DeviceName, ObjectiveName, RegimeName, resolved
-from training.cohort_options import takes_cohort
+from training.cohort_options import opened_cohort, takes_cohort
 from training.cohorts import CohortOptions
-from training.cohorts.sources import CohortSource, open_cohort
+from training.cohorts.sources import CohortSource
 from training.console import BAD_INPUT_STATUS, FAULT_STATUS, exit_status, progress, tell_findings, warn
 from training.sweep.priors import PriorName
 
@@ -65,7 +65,7 @@ def sweep(
         from training.sweep.workers import Sweep
 
         given = by_cell(bundle or ())
-        found = open_cohort(source, options)
+        found = opened_cohort(source, options)
         tell_findings(found)
         if not found.test:
             raise InvalidParameter(
