@@ -141,14 +141,18 @@ def _guarded(tools: DrawingTools, item: Record, work: Work) -> Record:
 
 
 def _fetch(tools: DrawingTools, item: Record) -> Record:
-    gap = tools.desk.fetch(item["object"], item["rule"])
+    gap = tools.desk.fetch(item["object"], item["rule"], _labels(item))
     return {"state": DONE} if gap is None else {"state": MISSING, "reason": gap}
+
+
+def _labels(item: Record) -> frozenset[int] | None:
+    return None if item["labels"] is None else frozenset(item["labels"])
 
 
 def _reconstruct(tools: DrawingTools, item: Record, check: Check) -> Record:
     desk, rule = tools.desk, tools.desk.configuration.rule(item["rule"])
     drawing, series = desk.drawing(item["object"]), series_of(desk.images(item["object"]))
-    labels = None if item["labels"] is None else frozenset(item["labels"])
+    labels = _labels(item)
     stacks = stacks_of_object(drawing, "object", tools.limits, labels, series.grid)
     model = tools.registry.get(rule.model)
     outcome = use_cases.reconstruct(model, stacks, _options(rule), tools.limits.max_voxels, check=check)

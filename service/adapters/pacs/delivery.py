@@ -49,10 +49,14 @@ class Desk:
         """The object that was received."""
         return read_object(io.BytesIO(self.blobs.get(f"{INBOX}/{identifier}/{OBJECT}")), "object")
 
-    def fetch(self, identifier: str, rule: str) -> str | None:
-        """Put the headers of the images beside the drawing; or, while any is missing, a sentence that says so."""
+    def fetch(self, identifier: str, rule: str, labels: frozenset[int] | None = None) -> str | None:
+        """Put the headers of the images beside the drawing; or, while any is missing, a sentence that says so.
+
+        Args:
+            labels: segments or regions that the rule chose, which are drawn on these images; all when None.
+        """
         drawing, name = self.drawing(identifier), self.configuration.rule(rule).fetch_from
-        study, series = str(drawing.StudyInstanceUID), str(referenced_series(drawing))
+        study, series = str(drawing.StudyInstanceUID), str(referenced_series(drawing, labels))
         with self._opened(name) as archive:
             found = archive.images(study, series)
         gap = _gap(referenced_images(drawing, series), found)
