@@ -1,4 +1,8 @@
-"""One answer beside the truth: intervals, voxels, vertices and time, by Laplace and by the ensemble."""
+"""One answer beside the truth: intervals, voxels, vertices and time, by Laplace and by the ensemble.
+
+The ensemble is that of the service, whose spread has what the contours leave open in it. The scatter of its refits
+alone, which the MorphoFlow paper takes for the uncertainty, stands beside it for vertices (``refits``).
+"""
 
 import time
 from collections.abc import Callable
@@ -11,6 +15,7 @@ from jaxtyping import Bool, Float
 from benchmarks.uncertainty.cells import Payload
 from model.bundle import ShapeModel
 from model.inference.estimates import estimate_of
+from model.inference.member_moves import member_moves
 from model.inference.mesh import Mesh, vertex_areas, volume_ml
 from model.inference.reconstruction import Options, Reconstruction, UncertaintyRule, reconstruct
 from model.inference.uncertainty import ShapeState, occupancy, surface_spread
@@ -37,6 +42,7 @@ def measure_answer(model: ShapeModel, case: Case, regime: Regime) -> Payload:
     smooth = distances_to(anti_aliased_points(case.mask, case.grid), answer.mesh.vertices)
     return {
         "volume": _volume(model, answer, case),
+        "ensemble_volume": _volume(model, ensemble[0], case),
         "voxels": {"laplace": _voxels(model, answer, case), "ensemble": _voxels(model, ensemble[0], case)},
         "vertices": _vertices(model, answer.mesh, answer.state, ensemble[0].state, errors, smooth),
         "seconds": {
@@ -98,4 +104,5 @@ def _vertices(
     for name, state in (("laplace", laplace), ("ensemble", ensemble)):
         spread = surface_spread(model, state, few)
         found[name] = [] if spread is None else spread.sd().round(4).tolist()
-    return found
+    moves = member_moves(model, ensemble.fits[0], ensemble.members, few)
+    return {**found, "refits": moves.std(axis=1, ddof=1).round(4).tolist()}

@@ -39,10 +39,12 @@ def answer(held=True, scale=1.0, vertices=4000):
     voxels = reliability(probability, RANDOM.uniform(size=20000) < probability)
     return {
         "volume": {"held": {"0.5": held, "0.9": held}},
+        "ensemble_volume": {"held": {"0.5": held, "0.9": False}},
         "voxels": {"laplace": voxels, "ensemble": voxels},
         "vertices": {
             "laplace": sd.tolist(),
             "ensemble": RANDOM.permutation(sd).tolist(),
+            "refits": RANDOM.permutation(sd).tolist(),
             "error_mm": error.tolist(),
             "smooth_error_mm": error.tolist(),
         },
