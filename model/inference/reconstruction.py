@@ -45,6 +45,11 @@ Watch = Callable[[str], None]
 OBSERVATION_BUDGET = 2500
 #: Of them at most so many off the contours for each one near them.
 COVER_SHARE_OF_BAND = 0.6
+#: What answers by an ensemble are told of.
+UNCALIBRATED = (
+    "Intervals and standard deviations by an ensemble are not calibrated, and hold the truth less often than they say; "
+    "those of uncertainty=laplace are calibrated."
+)
 
 
 @dataclass(frozen=True)
@@ -189,7 +194,7 @@ def reconstruct(
         extents=measure_extents(mesh, spread, options.extents, space),
         log_prior_density=density,
         typicality_percentile=percentile,
-        warnings=_warnings(found)
+        warnings=_warnings(found, options)
         + rival_warnings(found)
         + typicality_warnings(model, percentile)
         + plane_warnings(sections, _doubted(observations, found))
@@ -277,5 +282,6 @@ def _doubted(observations: Observations, found: Fit) -> Plane | None:
     return None if found.doubted is None else observations.planes[found.doubted]
 
 
-def _warnings(found: Fit) -> tuple[str, ...]:
-    return () if found.status == "converged" else (found.message,)
+def _warnings(found: Fit, options: Options) -> tuple[str, ...]:
+    stopped = () if found.status == "converged" else (found.message,)
+    return (*stopped, UNCALIBRATED) if options.uncertainty == "ensemble" else stopped

@@ -14,6 +14,7 @@ from model.inference.observations import MaskStack, Plane, section_of
 from model.inference.posterior import fitted_jacobians
 from model.inference.reconstruction import (
     OBSERVATION_BUDGET,
+    UNCALIBRATED,
     Options,
     reconstruct,
 )
@@ -132,6 +133,7 @@ def test_with_uncertainty_intervals_surround_the_figures(rule):
     assert (spread >= 0).all()
     assert 0.01 < spread.max() < 2.0
     assert (answer.state.covariance is None) == (rule == "ensemble")
+    assert (UNCALIBRATED in answer.warnings) == (rule == "ensemble")
     assert len(answer.state.members) == (25 if rule == "ensemble" else 0)
 
 
