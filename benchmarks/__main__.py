@@ -6,9 +6,9 @@ from typing import Annotated
 import typer
 
 from benchmarks import request
-from training import cli
 from training.choices import RegimeName
 from training.cohorts import CohortName
+from training.evaluate_command import evaluate
 
 DATA = Path("../shared/data")
 
@@ -28,7 +28,7 @@ def main(
         return
     typer.echo()
     regimes = [RegimeName.THIN, RegimeName.THICK, RegimeName.ORTHOGONAL]
-    cli.evaluate(model=model, cohort=cohort, data=data, regime=regimes, limit=cases)
+    evaluate(model=model, cohort=cohort, data=data, regime=regimes, limit=cases)
 
 
 if __name__ == "__main__":

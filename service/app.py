@@ -39,6 +39,7 @@ from service.routes.reconstructions import reconstructions_router
 from service.routes.results import results_router
 from service.routes.samples import samples_router
 from service.routes.stow import stow_router
+from service.routes.turns import Turns
 from service.schemas import Problem, SurfaceSd
 from service.settings import Settings
 from service.stores import open_blobs, open_jobs, open_results
@@ -82,6 +83,7 @@ def create_app(
         write_volume=write_nifti,
         modes=PerModel(shape_modes),
         jobs=jobs,
+        turns=Turns(),
         blobs=blobs,
         metrics=Metrics(engine, jobs),
         log=log or make_log(settings.log_level),

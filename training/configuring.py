@@ -20,7 +20,6 @@ def configured_for(
     regime: RegimeName,
     latent_size: int,
     *,
-    known: bool,
     reflect: bool | None,
     flow: bool | None,
     ard: bool | None,
@@ -34,8 +33,7 @@ def configured_for(
     """The configuration that the options describe, with batches and steps for the size of the cohort.
 
     Args:
-        known: whether it is known of which sides the shapes are.
-        reflect: whether mirror images join; where a known cohort has no sides, when None, but not in the paper's
+        reflect: whether mirror images join; those of a cohort without sides, when None, but not in the paper's
             objective.
         flow, ard, ard_weight: see `training.choices.configured`.
         steps, epochs: see `training.choices.with_duration`.
@@ -44,7 +42,7 @@ def configured_for(
     Raises:
         InvalidParameter: steps and epochs were both given, or the device is not there.
     """
-    paired = (known and cohort.reflects and objective is not ObjectiveName.PAPER) if reflect is None else reflect
+    paired = (cohort.reflects and objective is not ObjectiveName.PAPER) if reflect is None else reflect
     config = configured(
         objective,
         regime,

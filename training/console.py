@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -14,6 +15,7 @@ from model.errors import CohortError, InputError, InvalidParameter, MorphoFlowEr
 from training.cohorts import Cohort
 from training.interruption import Stopped
 
+JsonOption = Annotated[bool, typer.Option("--json", help="Write the result as JSON.")]
 #: Errors that the caller can mend.
 BAD_INPUT = (InputError, CohortError, NotFound)
 BAD_INPUT_STATUS, FAULT_STATUS = 2, 1

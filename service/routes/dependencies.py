@@ -23,6 +23,7 @@ from service.ports import (
     WorkEngine,
 )
 from service.routes.problems import NamedNotFound
+from service.routes.turns import Turns
 from service.settings import Settings
 
 
@@ -40,6 +41,7 @@ class Services:
     write_volume: VolumeWriter
     modes: ModeSource
     jobs: JobEngine
+    turns: Turns
     blobs: BlobStore
     metrics: Metrics
     log: Log

@@ -1,15 +1,12 @@
 """How requests become jobs: idempotency, a bound on their number, and the answer 202."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
-from anyio import CapacityLimiter, fail_after
-from anyio.to_thread import run_sync
 from fastapi import Header, Request
 from starlette.responses import JSONResponse, Response
 
 from model.errors import InvalidParameter, UnknownModel
-from service.errors import Overloaded
 from service.job_ports import JobStatus
 from service.job_presentation import job_summary
 from service.job_submission import JobDesk
@@ -19,8 +16,6 @@ from service.routes.negotiation import listed
 
 T = TypeVar("T")
 JOBS_PATH = "/v1/jobs"
-#: Requests about jobs that are worked on at the same time, and how long (s) the next one waits for its turn.
-TURNS, TURN_S = 8, 5.0
 
 _KEY: dict[str, Any] = {"alias": "Idempotency-Key", "min_length": 1, "max_length": 255}
 _SAME = "the same key with the same request leads to the same job, however often it is sent"
@@ -61,40 +56,6 @@ def submittable_model(services: Services, name: str | None) -> str:
         return pinned_name(services.registry.get(name))
     except UnknownModel as error:
         raise InvalidParameter(str(error), part="model") from None
-
-
-class Turns:
-    """Threads for what asks for jobs, so that a database that does not answer holds up no other request."""
-
-    def __init__(self, count: int = TURNS, wait_s: float = TURN_S) -> None:
-        self._turns, self._threads = CapacityLimiter(count), CapacityLimiter(count)
-        self._wait_s = wait_s
-
-    async def run(self, call: Callable[..., T], *arguments: Any) -> T:
-        """The call's answer.
-
-        Raises:
-            Overloaded: all turns were taken for as long as may be waited.
-        """
-        turn = object()
-        try:
-            with fail_after(self._wait_s):
-                await self._turns.acquire_on_behalf_of(turn)
-        except TimeoutError:
-            raise Overloaded("Requests about jobs are not answered now; send the request again later.") from None
-        try:
-            return await run_sync(call, *arguments, limiter=self._threads)
-        finally:
-            self._turns.release_on_behalf_of(turn)
-
-
-def turns_of(request: Request) -> Turns:
-    """Those of the application that a request came to; asked for in its event loop alone."""
-    state = request.app.state
-    if not hasattr(state, "job_turns"):
-        state.job_turns = Turns()
-    turns: Turns = state.job_turns
-    return turns
 
 
 def submit(

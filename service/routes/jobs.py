@@ -25,11 +25,9 @@ from service.routes.job_requests import (
     JOB_ACCEPTED,
     JOBS_PATH,
     IdempotencyKey,
-    Turns,
     accepted_job,
     submit,
     submittable_model,
-    turns_of,
 )
 from service.routes.responses import ZIP, attachment, files, problems
 from service.routes.strict import StrictRoute
@@ -100,7 +98,7 @@ async def create_job(
     key: IdempotencyKey = None,
 ) -> Response:
     """Answers at once; the work is done by other processes and goes on after a restart."""
-    return accepted_job(request, await turns_of(request).run(_submitted, services, form, key))
+    return accepted_job(request, await services.turns.run(_submitted, services, form, key))
 
 
 def _submitted(services: Services, form: JobForm, key: str | None) -> JobStatus:
@@ -114,13 +112,13 @@ def _submitted(services: Services, form: JobForm, key: str | None) -> JobStatus:
 
 async def read_job(identifier: Identifier, request: Request, services: WithServices) -> JobSummary:
     """Items that are made, and the estimated time to the end."""
-    status = await turns_of(request).run(services.jobs.status, identifier)
+    status = await services.turns.run(services.jobs.status, identifier)
     return job_summary(status, address(request, ""))
 
 
 async def end_job(identifier: Identifier, request: Request, services: WithServices) -> Response:
     """What runs stops within a second; a job that had ended is forgotten."""
-    cancelled = await turns_of(request).run(_ended, services, identifier)
+    cancelled = await services.turns.run(_ended, services, identifier)
     if cancelled is None:
         return Response(status_code=204)
     return JSONResponse(job_summary(cancelled, address(request, "")).model_dump(mode="json"))
@@ -138,15 +136,14 @@ def _ended(services: Services, identifier: str) -> JobStatus | None:
 
 async def read_events(identifier: Identifier, request: Request, services: WithServices) -> Response:
     """An event `progress` with the job's summary at each change, then one called `end`."""
-    turns = turns_of(request)
-    first = await turns.run(services.jobs.status, identifier)
-    stream = _events(services, turns, first, address(request, ""))
+    first = await services.turns.run(services.jobs.status, identifier)
+    stream = _events(services, first, address(request, ""))
     return StreamingResponse(stream, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 
 
 async def read_result(identifier: Identifier, request: Request, services: WithServices) -> Response:
     """A ZIP that streams while it is read; the same items as of single requests."""
-    status = await turns_of(request).run(services.jobs.status, identifier)
+    status = await services.turns.run(services.jobs.status, identifier)
     if status.state is JobState.CANCELLED:
         raise Cancelled("The job was cancelled, so it has no result.")
     if status.state is not JobState.DONE or status.result is None:
@@ -158,7 +155,7 @@ async def read_result(identifier: Identifier, request: Request, services: WithSe
     return StreamingResponse(chunks, media_type=ZIP, headers=attachment(f"{status.kind}.zip"))
 
 
-async def _events(services: Services, turns: Turns, status: JobStatus, prefix: str) -> AsyncIterator[str]:
+async def _events(services: Services, status: JobStatus, prefix: str) -> AsyncIterator[str]:
     told, silent_s = None, 0.0
     while True:
         now = (status.state, status.done, status.total)
@@ -174,7 +171,7 @@ async def _events(services: Services, turns: Turns, status: JobStatus, prefix: s
         await asyncio.sleep(_EVENT_POLL_S)
         silent_s += _EVENT_POLL_S
         with suppress(Overloaded):  # the database is away; the next look may find it
-            status = await turns.run(services.jobs.status, status.id)
+            status = await services.turns.run(services.jobs.status, status.id)
 
 
 def _zip(job: JobFiles, kind: str, count: int) -> Iterator[bytes]:

@@ -26,7 +26,6 @@ from service.routes.job_requests import (
     accepted_job,
     submit,
     submittable_model,
-    turns_of,
     wants_job,
 )
 from service.routes.masks import read_stacks
@@ -96,7 +95,7 @@ async def create_reconstruction(
     if len(form.mask) > services.settings.max_masks:
         raise TooLarge(f"At most {services.settings.max_masks} parts named mask are accepted.", part="mask")
     if as_job:
-        return await turns_of(request).run(_enqueue, request, services, form, key)
+        return await services.turns.run(_enqueue, request, services, form, key)
     with services.engine.admit() as ticket:
         result = await run_while_connected(request, ticket, partial(_reconstruct, services, form))
     return await run_in_threadpool(_answer, request, services, result, wanted)

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import httpx
 import pytest
 
-from service.routes.job_requests import TURN_S
+from service.routes.turns import TURN_S
 from tests.service_parts import NAME, app_for, mask_parts, running
 
 JOB = "/v1/jobs/978c126b-b4af-545f-93fa-20cf3c9be9b8"

@@ -58,11 +58,6 @@ class CohortSource:
         """Whether any was asked for."""
         return any(one is not None for one in (self.cohort, self.masks, self.meshes))
 
-    @property
-    def states_side(self) -> bool:
-        """Whether it is known which sides the shapes are of."""
-        return self.cohort is not None or self.side is not None
-
 
 #: Layouts whose files are label maps.
 LABELLED = (LayoutName.FOLDER, LayoutName.DECATHLON, LayoutName.VERSE, LayoutName.OAI_ZIB)

@@ -34,7 +34,7 @@ def report(
     ] = False,
     command: Annotated[list[str] | None, typer.Option(help="A line on how the sweeps were made; may repeat.")] = None,
     force: ForceOption = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Write the result as JSON.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Write the paper's tables and figure panels of sweeps as one HTML file and as CSV."""
     with exit_status():

@@ -108,17 +108,12 @@ def run_cell(
     effort: Effort,
     device: DeviceName,
     *,
-    known: bool,
     watch: Watch = lambda words, done, total: None,
 ) -> Result:
-    """Bring a cell to its result, from wherever an earlier attempt left it.
-
-    Args:
-        known: whether it is known of which sides the shapes are, see `training.configuring`.
-    """
+    """Bring a cell to its result, from wherever an earlier attempt left it."""
     begin = time.perf_counter()
     if not place.is_exported:
-        config = config_of(cell, cohort, effort, device, known=known)
+        config = config_of(cell, cohort, effort, device)
         if not is_finished(place.run, cohort, config):
             prepared(cohort, config, place.run).go(lambda step, _: watch("training", step, config.steps))
         _export(place, cohort, effort, _parts(cell, place, cohort, effort))
@@ -151,14 +146,13 @@ def _parts(cell: Cell, place: Place, cohort: Cohort, effort: Effort) -> PriorPar
     return chosen_parts(place.run, parts, cohort.validation, cell.measured_in, precisions).parts
 
 
-def config_of(cell: Cell, cohort: Cohort, effort: Effort, device: DeviceName, *, known: bool) -> TrainingConfig:
+def config_of(cell: Cell, cohort: Cohort, effort: Effort, device: DeviceName) -> TrainingConfig:
     """The configuration of a cell's training."""
     return configured_for(
         cohort,
         ObjectiveName(cell.objective),
         RegimeName(cell.regime),
         cell.latent_size,
-        known=known,
         reflect=effort.reflect,
         flow=cell.together and cell.prior.flow,
         ard=cell.together and cell.prior.ard,

@@ -54,7 +54,7 @@ def sweep(
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; one a CPU core when left out.")] = None,
     device: Annotated[DeviceName, typer.Option(help="Where to compute.")] = DeviceName.AUTO,
-    as_json: Annotated[bool, typer.Option("--json", help="Write the result as JSON.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Train and measure many models side by side, cell by cell; what is there is skipped."""
     with exit_status():

@@ -61,8 +61,8 @@ def _next_run(sweep: Sweep, key: str, cell: Cell, cohorts: Cohorts, holding: Exi
     place = Place.of(sweep.folder, cell)
     if not holding.enter_context(held(sweep.folder / TRAININGS / key)) or place.is_exported:
         return None
-    cohort, known = cohorts.of(cell), sweep.source.states_side
-    config = config_of(cell, cohort, sweep.effort, sweep.device, known=known)
+    cohort = cohorts.of(cell)
+    config = config_of(cell, cohort, sweep.effort, sweep.device)
     try:
         return None if is_finished(place.run, cohort, config) else prepared(cohort, config, place.run)
     except MorphoFlowError:

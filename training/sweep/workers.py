@@ -132,8 +132,8 @@ def _attempt(sweep: Sweep, cell: Cell, cohorts: Cohorts, watch: Watch) -> None:
     refused.parent.mkdir(parents=True, exist_ok=True)
     refused.unlink(missing_ok=True)
     try:
-        place, known = Place.of(sweep.folder, cell), sweep.source.states_side
-        result = run_cell(cell, cohorts.of(cell), place, sweep.effort, sweep.device, known=known, watch=watch)
+        place = Place.of(sweep.folder, cell)
+        result = run_cell(cell, cohorts.of(cell), place, sweep.effort, sweep.device, watch=watch)
         append(sweep.folder, result)
     except MorphoFlowError as error:
         refused.write_text(str(error), encoding="utf-8")

@@ -1,6 +1,4 @@
-"""Mirror images join where it is known that the structure has no side."""
-
-from pathlib import Path
+"""Mirror images join where the cohort says that the structure has no side."""
 
 import pytest
 
@@ -8,18 +6,16 @@ from tests.ellipsoid_cohort import GRID, ellipsoids
 from training.choices import DeviceName, ObjectiveName, RegimeName
 from training.cohorts import Case, Cohort, Provenance
 from training.cohorts.cohort import NOT_STATED, SideName
-from training.cohorts.sources import CohortName, CohortSource
 from training.configuring import configured_for
 
 
 def reflected(side, **more):
-    source = CohortSource(masks=Path("masks"), side=side)
     cases = tuple(Case(f"e{n}", f"e{n}", "train", shape.mask(GRID), GRID) for n, shape in enumerate(ellipsoids(4)))
     made = Provenance("made here", "CC0-1.0", "nobody", shippable=True)
     cohort = Cohort("ellipsoids", cases, (), (), (), made, NOT_STATED if side is None else side.value)
     choices = {"objective": ObjectiveName.VARIATIONAL, "reflect": None, **more}
     return configured_for(
-        cohort, regime=RegimeName.DENSE, latent_size=4, known=source.states_side, flow=None, ard=None, steps=8,
+        cohort, regime=RegimeName.DENSE, latent_size=4, flow=None, ard=None, steps=8,
         patience=0, seed=0, device=DeviceName.CPU, **choices,
     ).reflected  # fmt: skip
 
@@ -33,8 +29,3 @@ def test_only_a_structure_without_sides_is_mirrored_unless_it_is_asked_for(side)
 
 def test_the_papers_objective_has_no_mirror_images():
     assert not reflected(SideName.UNPAIRED, objective=ObjectiveName.PAPER)
-
-
-def test_public_cohorts_state_their_side():
-    assert CohortSource(cohort=CohortName.TALUS).states_side
-    assert not CohortSource(masks=Path("masks")).states_side
