@@ -10,7 +10,7 @@ import typer
 
 from model.errors import CohortError, InvalidParameter
 from training.cohorts.sources import open_cohort
-from training.console import exit_status, progress
+from training.console import JsonOption, exit_status, progress
 from training.outputs import ForceOption, check_new_files
 
 if TYPE_CHECKING:

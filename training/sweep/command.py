@@ -13,7 +13,7 @@ from training.choices import DeviceName, ObjectiveName, RegimeName, resolved
 from training.cohort_options import opened_cohort, takes_cohort
 from training.cohorts import CohortOptions
 from training.cohorts.sources import CohortSource
-from training.console import BAD_INPUT_STATUS, FAULT_STATUS, exit_status, progress, tell_findings, warn
+from training.console import BAD_INPUT_STATUS, FAULT_STATUS, JsonOption, exit_status, progress, tell_findings, warn
 from training.sweep.priors import PriorName
 
 if TYPE_CHECKING:
