@@ -27,7 +27,7 @@ $(VENV)/.demo: $(BIN)/python $(LOCKS)
 	@touch $@ $(VENV)/.service
 
 $(VENV)/.development: $(BIN)/python $(LOCKS)
-	$(PIP) install --quiet -c constraints.txt -e '.[bench,cluster,training,demo,pacs,test,dev]'
+	$(PIP) install --quiet -c constraints.txt -e '.[test,dev]'
 	@touch $@ $(VENV)/.service $(VENV)/.demo
 
 setup: $(VENV)/.development  ## install everything that develops and tests
@@ -67,7 +67,7 @@ wheel: $(VENV)/.development  ## build/dist/*.whl
 
 lock:  ## renew constraints.txt from an environment of its own
 	rm -rf build/lock && $(PYTHON) -m venv build/lock
-	build/lock/bin/pip install --quiet 'torch==$(TORCH)' '.[bench,cluster,training,demo,pacs,test,dev]'
+	build/lock/bin/pip install --quiet 'torch==$(TORCH)' '.[test,dev]'
 	head -n 2 constraints.txt > build/constraints.txt
 	build/lock/bin/pip freeze --exclude morphoflow | sed 's/+cpu$$//' >> build/constraints.txt
 	mv build/constraints.txt constraints.txt

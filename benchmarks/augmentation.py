@@ -22,6 +22,7 @@ from scipy.stats import rankdata, t
 from benchmarks.generator.density import GaussianPrior
 from benchmarks.generator.surfaces import Surface, decoded, surface_of_mask
 from model.bundle import ShapeModel
+from training.cohort_options import DataOption
 from training.cohorts import CohortName, CohortOptions, data_folder, load_cohort
 from training.cohorts.adrenal import ARCHIVE
 from training.cohorts.cohort import Case
@@ -53,7 +54,7 @@ def main(
     seeds: Annotated[int, typer.Option(min=2, help="Repetitions, each with a share of its own.")] = 10,
     synthetic: Annotated[int, typer.Option(min=2, help="Synthetic shapes of each class.")] = 100,
     spacing_mm: Annotated[float, typer.Option(help="Grid step of synthetic surfaces (mm).")] = 2.0,
-    data: Annotated[Path | None, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = None,
+    data: DataOption = None,
 ) -> None:
     """Measure and print a table."""
     with exit_status():

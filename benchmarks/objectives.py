@@ -16,17 +16,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from training.autodecoder import AutoDecoder
-from training.choices import DeviceName, ObjectiveName, RegimeName, configured, with_batches, with_duration
-from training.cohorts import Cohort, CohortName, CohortOptions, load_cohort
+from training.choices import ObjectiveName, RegimeName, TrainingChoice
+from training.cohort_options import DataOption
+from training.cohorts import Cohort, CohortName, CohortOptions, data_folder, load_cohort
 from training.config import TrainingConfig
-from training.console import progress
+from training.configuring import configured_for
+from training.console import exit_status, progress
 from training.points import cohort_points
 from training.pruning import refitted
 from training.release import active_dimensions
 from training.runs import half_extent, train_cohort
 from training.validation import Validation
 
-DATA = Path("../shared/data")
 #: Shapes of each split whose codes are fitted.
 SHAPES = 24
 #: Dimensions count as dead when without all of them Dice falls by less.
@@ -56,10 +57,8 @@ class Row:
 
 def configuration(objective: ObjectiveName, steps: int, cohort: Cohort, *, together: bool = True) -> TrainingConfig:
     """The objective with its own defaults; mirror images are left out, so that all see the same shapes."""
-    config = configured(
-        objective, RegimeName.DENSE, 64, flow=together, ard=together, reflected=False, seed=0, device=DeviceName.AUTO
-    )
-    return with_duration(with_batches(config, len(cohort.train)), steps, None, len(cohort.train))
+    choice = TrainingChoice(objective, RegimeName.DENSE, 64, flow=together, ard=together, reflect=False, steps=steps)
+    return configured_for(cohort, choice)
 
 
 def trained(cohort: Cohort, config: TrainingConfig, folder: Path) -> AutoDecoder:
@@ -132,13 +131,14 @@ def lines(rows: dict[str, Row]) -> Iterator[str]:
 
 def main(
     cohort: Annotated[CohortName, typer.Option(help="Cohort to train on.")] = CohortName.HIPPOCAMPUS,
-    data: Annotated[Path, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = DATA,
+    data: DataOption = None,
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each.")] = 2000,
     objective: Annotated[list[ObjectiveName] | None, typer.Option(help="May repeat; all when left out.")] = None,
     folder: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("build/objectives"),
 ) -> None:
     """Train one model with each objective and compare them."""
-    found = load_cohort(cohort, data, CohortOptions(skip_refused=True))
+    with exit_status():
+        found = load_cohort(cohort, data_folder(data), CohortOptions(skip_refused=True))
     rows: dict[str, Row] = {}
     for name in objective or list(ObjectiveName):
         config = configuration(name, steps, found)

@@ -6,7 +6,6 @@ drawing, and whether the answer says that it is not reliable.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -20,7 +19,9 @@ from model.geometry import Grid
 from model.inference.fitting import MirrorRule
 from model.inference.reconstruction import Options, reconstruct
 from model.inference.uncertainty import occupancy
-from training.cohorts import Case, CohortName, CohortOptions, load_cohort
+from training.cohort_options import DataOption
+from training.cohorts import Case, CohortName, CohortOptions, data_folder, load_cohort
+from training.console import exit_status
 from training.evaluate import find_bundle, shipped_bundles
 from training.metrics_masks import agreement
 from training.perturb import (
@@ -39,7 +40,6 @@ from training.perturb import (
 )
 from training.sparsify import for_evaluation
 
-DATA = Path("../shared/data")
 OFFSET_MM = (20.0, -20.0, 20.0)
 TURN_DEGREES = 20.0
 TILTS_DEGREES = (15.0, 30.0, 45.0)
@@ -189,13 +189,14 @@ def _pair(
 def main(
     model: Annotated[str, typer.Option(help="Name of a shipped model, or the folder of a bundle.")] = "hippocampus",
     cohort: Annotated[CohortName, typer.Option(help="Cohort of the model.")] = CohortName.HIPPOCAMPUS,
-    data: Annotated[Path, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = DATA,
+    data: DataOption = None,
     cases: Annotated[int, typer.Option(min=1, max=200, help="Cases, at most.")] = 30,
     validation: Annotated[bool, typer.Option(help="Validation cases in place of test cases.")] = False,
 ) -> None:
     """Accuracy from disturbed drawings."""
-    opened = open_bundle(find_bundle(model, [shipped_bundles()]))
-    found = load_cohort(cohort, data, CohortOptions(skip_refused=True))
+    with exit_status():
+        opened = open_bundle(find_bundle(model, [shipped_bundles()]))
+        found = load_cohort(cohort, data_folder(data), CohortOptions(skip_refused=True))
     chosen = (found.validation if validation else found.test)[:cases]
     heads = ("ASD mm", "disturbed", "ratio", "warned", "borne or warned", "warned before")
     widths = (9, 10, 8, 9, 17, 15)

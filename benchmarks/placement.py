@@ -5,7 +5,6 @@ The drawing's affine is changed, not its voxels: the reconstruction has to come 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -18,12 +17,13 @@ from model.geometry import Grid
 from model.inference.fitting import MirrorRule
 from model.inference.reconstruction import Options, reconstruct
 from model.inference.uncertainty import occupancy
-from training.cohorts import Case, CohortName, CohortOptions, load_cohort
+from training.cohort_options import DataOption
+from training.cohorts import Case, CohortName, CohortOptions, data_folder, load_cohort
+from training.console import exit_status
 from training.evaluate import find_bundle, shipped_bundles
 from training.metrics_masks import MaskAgreement, agreement
 from training.sparsify import Regime, for_evaluation
 
-DATA = Path("../shared/data")
 REGIMES: tuple[Regime, ...] = ("orthogonal", "thin")
 OFFSET_MM = (20.0, -20.0, 20.0)
 
@@ -75,12 +75,13 @@ def measure(model: ShapeModel, case: Case, regime: Regime, placement: Placement)
 def main(
     model: Annotated[str, typer.Option(help="Name of a shipped model, or the folder of a bundle.")] = "hippocampus",
     cohort: Annotated[CohortName, typer.Option(help="Cohort of the model.")] = CohortName.HIPPOCAMPUS,
-    data: Annotated[Path, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = DATA,
+    data: DataOption = None,
     cases: Annotated[int, typer.Option(min=1, max=200, help="Test cases, at most.")] = 30,
 ) -> None:
     """Accuracy of the same drawings in other places."""
-    opened = open_bundle(find_bundle(model, [shipped_bundles()]))
-    chosen = load_cohort(cohort, data, CohortOptions()).test[:cases]
+    with exit_status():
+        opened = open_bundle(find_bundle(model, [shipped_bundles()]))
+        chosen = load_cohort(cohort, data_folder(data), CohortOptions()).test[:cases]
     typer.echo(f"{'placement':24}{'regime':12}{'Dice':>8}{'ASD mm':>8}")
     for placement in placements():
         for regime in REGIMES:

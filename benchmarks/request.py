@@ -4,7 +4,7 @@ Starts the service with its shipped models in a process of its own, sends sparse
 the surface (binary STL) from the answer. Masks are drawn from a cohort's test cases, three orthogonal slices and every
 8th axial slice, or read from a file. The first request of each kind is not counted.
 
-    python -m benchmarks.request --cohort hippocampus --data ../shared/data
+    python -m benchmarks.request --cohort hippocampus --data FOLDER
     python -m benchmarks.request --mask docs/examples/hippocampus_three_slices.nii.gz
 """
 
@@ -22,7 +22,9 @@ import numpy as np
 import typer
 
 from benchmarks.server import Server, serving
+from training.cohort_options import DataOption
 from training.cohorts import CohortName, CohortOptions, data_folder, load_cohort
+from training.console import exit_status
 from training.sparsify import Regime, for_evaluation
 
 EXAMPLE = Path("docs/examples/hippocampus_three_slices.nii.gz")
@@ -56,7 +58,7 @@ def main(
     model: Annotated[str | None, typer.Option(help="Name of a loaded model; the cohort's when left out.")] = None,
     bundle: Annotated[list[Path] | None, typer.Option(help="Folder of a further bundle; may repeat.")] = None,
     cohort: Annotated[CohortName | None, typer.Option(help="Cohort whose test cases are drawn.")] = None,
-    data: Annotated[Path | None, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = None,
+    data: DataOption = None,
     mask: Annotated[Path, typer.Option(help="Sparse mask (.nii.gz) that is sent when no cohort is named.")] = EXAMPLE,
     cases: Annotated[int, typer.Option(min=1, max=200, help="Cases of the cohort, at most.")] = 10,
     repeats: Annotated[int, typer.Option(min=1, max=200, help="Requests for each case and kind.")] = 5,
@@ -64,7 +66,8 @@ def main(
     as_json: Annotated[bool, typer.Option("--json", help="Write JSON.")] = False,
 ) -> None:
     """Measure requests against the running service."""
-    postings = list(drawn_cases(cohort, data, cases)) if cohort else [Posting("file", mask.read_bytes())]
+    with exit_status():
+        postings = list(drawn_cases(cohort, data, cases)) if cohort else [Posting("file", mask.read_bytes())]
     reference = matrix_rate()
     with serving(tuple(bundle or ())) as server:
         idle = server.peak_memory_mib()

@@ -21,7 +21,7 @@ import typer
 from torch.utils.flop_counter import FlopCounterMode
 
 from training.autodecoder import READ_EVERY, Trainer
-from training.choices import DeviceName, ObjectiveName, RegimeName, configured, with_batches
+from training.choices import DeviceName, ObjectiveName, RegimeName, TrainingChoice, configured, with_batches
 from training.samples import ShapePoints
 
 LARGE = 2048
@@ -112,16 +112,10 @@ def profiled(trainer: Trainer, steps: int) -> str:
 
 
 def _trainer(latent_size: int, shapes: int, device: DeviceName, *, together: bool) -> Trainer:
-    config = configured(
-        ObjectiveName.VARIATIONAL,
-        RegimeName.DENSE,
-        latent_size,
-        flow=together,
-        ard=together,
-        reflected=False,
-        seed=0,
-        device=device,
+    choice = TrainingChoice(
+        ObjectiveName.VARIATIONAL, RegimeName.DENSE, latent_size, flow=together, ard=together, device=device
     )
+    config = configured(choice, reflected=False)
     trainer = Trainer.start(with_batches(config, shapes), [_ball(number) for number in range(shapes)])
     trainer.step = int(config.flow_start * config.steps) + 1
     return trainer

@@ -8,14 +8,12 @@ It costs five fits and is as much as the model knows, so it bounds what any chea
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 from jaxtyping import Float
 
-from benchmarks.perturbations import DATA
 from model.bundle import ShapeModel, open_bundle
 from model.inference.discrepancy.conditioning import discrepancy_prior, with_discrepancy
 from model.inference.discrepancy.contours import contour_points
@@ -25,8 +23,10 @@ from model.inference.fitting import fit, refit
 from model.inference.observations import Observations, observe
 from model.inference.posterior import fitted_jacobians, laplace_covariance, normal_displacements
 from model.inference.reconstruction import COVER_SHARE_OF_BAND, OBSERVATION_BUDGET
-from training.cohorts import CohortName, CohortOptions, load_cohort
+from training.cohort_options import DataOption
+from training.cohorts import CohortName, CohortOptions, data_folder, load_cohort
 from training.cohorts.cohort import Case
+from training.console import exit_status
 from training.evaluate import find_bundle, shipped_bundles
 from training.perturb import WRONG_KINDS, Sections, WrongKind, parallel, with_wrong
 
@@ -72,12 +72,13 @@ def distance(model: ShapeModel, found: Fit, points: Float[np.ndarray, "n 3"]) ->
 def main(
     model: Annotated[str, typer.Option(help="Name of a shipped model, or the folder of a bundle.")] = "hippocampus",
     cohort: Annotated[CohortName, typer.Option(help="Cohort of the model.")] = CohortName.HIPPOCAMPUS,
-    data: Annotated[Path, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = DATA,
+    data: DataOption = None,
     cases: Annotated[int, typer.Option(min=2, max=200, help="Validation cases, at most.")] = 40,
 ) -> None:
     """Tell wrong slices from sound ones by all that the model knows."""
-    opened = open_bundle(find_bundle(model, [shipped_bundles()]))
-    chosen = load_cohort(cohort, data, CohortOptions(skip_refused=True)).validation[:cases]
+    with exit_status():
+        opened = open_bundle(find_bundle(model, [shipped_bundles()]))
+        chosen = load_cohort(cohort, data_folder(data), CohortOptions(skip_refused=True)).validation[:cases]
     sound = np.array([surprise(opened, parallel(case.mask, case.grid)) for case in chosen])
     limit = float(np.quantile(sound, 1.0 - FALSE_ALARMS))
     typer.echo(

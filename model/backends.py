@@ -5,7 +5,8 @@ ONNX Runtime stands behind them by default, TorchScript when asked for. Batches 
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,6 +15,7 @@ import onnxruntime
 from jaxtyping import Bool, Float
 
 from model.chunks import Array, Network, Workers
+from model.errors import BundleCorrupt, BundleError
 from model.geometry import CanonicalLattice
 
 
@@ -160,7 +162,8 @@ def load_torchscript(folder: Path, latent_size: int, threads: int | None) -> tup
     """Decoder and prior of a bundle on TorchScript; needs the extra ``torch``."""
     from model.networks import torchscript
 
-    return torchscript.load(folder, latent_size, threads)
+    with _opening("One of the files .pt"):
+        return torchscript.load(folder, latent_size, threads)
 
 
 def onnx_completer(graph: Path, lattice: CanonicalLattice, threads: int | None) -> Completer:
@@ -172,7 +175,8 @@ def torchscript_completer(graph: Path, lattice: CanonicalLattice, threads: int |
     """A completion network on TorchScript; needs the extra ``torch``."""
     from model.networks import torchscript
 
-    return torchscript.load_completer(graph, lattice, threads)
+    with _opening(graph.name):
+        return torchscript.load_completer(graph, lattice, threads)
 
 
 def _fixed_point(step: Any, target: Float[np.ndarray, "b d"]) -> Float[np.ndarray, "b d"]:
@@ -187,8 +191,8 @@ def _fixed_point(step: Any, target: Float[np.ndarray, "b d"]) -> Float[np.ndarra
 
 
 def _numbered(folder: Path, suffix: str) -> list[Path]:
-    found = folder.glob(f"prior_sampling_*{suffix}")
-    return sorted(found, key=lambda path: int(path.stem.rsplit("_", 1)[1]))
+    numbers = {path: path.stem.rsplit("_", 1)[1] for path in folder.glob(f"prior_sampling_*{suffix}")}
+    return sorted((path for path in numbers if numbers[path].isdecimal()), key=lambda path: int(numbers[path]))
 
 
 def _session(path: Path, threads: int | None) -> onnxruntime.InferenceSession:
@@ -198,7 +202,21 @@ def _session(path: Path, threads: int | None) -> onnxruntime.InferenceSession:
     # Idle workers that spin steal cycles from the arithmetic around the graph.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    with _opening(path.name):
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+@contextmanager
+def _opening(graph: str) -> Iterator[None]:
+    """What a backend raises over a graph is a fault of the bundle; its errors have no parent in common."""
+    try:
+        yield
+    except (BundleError, ImportError, OSError):
+        raise
+    except Exception as error:
+        raise BundleCorrupt(
+            f"{graph} is not a graph that this program can open; export the model anew, or update the program."
+        ) from error
 
 
 def _network(session: onnxruntime.InferenceSession, outputs: Sequence[str] | None = None) -> Network:

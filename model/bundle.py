@@ -167,7 +167,7 @@ def _completer(folder: Path, manifest: Manifest, backend: BackendName, threads: 
     try:
         i, j, k = map(int, known["voxels"])
         lattice = CanonicalLattice((i, j, k), float(known["step_mm"]))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise BundleCorrupt(
             f"{MANIFEST} does not say on which lattice its network completes drawings; one written by morphoflow "
             "complete is accepted."
@@ -268,11 +268,28 @@ def _check_file(path: Path, expected: str) -> None:
 
 
 def _read_population(path: Path, latent_size: int) -> Population:
-    with np.load(path, allow_pickle=False) as stored:
-        missing = [f.name for f in fields(Population) if f.name not in stored]
-        if missing:
-            raise BundleCorrupt(f"{path.name} lacks {', '.join(missing)}; export the model anew.")
-        population = Population(**{f.name: stored[f.name] for f in fields(Population)})
-    if population.codes.shape[1:] != (latent_size,) or population.base_codes.shape != population.codes.shape:
+    stored = _arrays(path)
+    missing = [f.name for f in fields(Population) if f.name not in stored]
+    if missing:
+        raise BundleCorrupt(f"{path.name} lacks {', '.join(missing)}; export the model anew.")
+    codes = stored["codes"]
+    if codes.shape[1:] != (latent_size,) or stored["base_codes"].shape != codes.shape:
         raise BundleCorrupt(f"{path.name} holds codes of another size than the manifest's latent_size {latent_size}.")
-    return population
+    for name in ("log_densities", "volumes_ml"):
+        if stored[name].shape != codes.shape[:1]:
+            raise BundleCorrupt(f"{path.name} must hold as many {name} as codes; export the model anew.")
+    population = {f.name: stored[f.name] for f in fields(Population)}
+    if not all(np.issubdtype(values.dtype, np.floating) for values in population.values()):
+        raise BundleCorrupt(f"{path.name} must hold floating-point numbers alone; export the model anew.")
+    return Population(**population)
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of a file by name."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            return dict(stored)
+    except OSError:
+        raise
+    except Exception as error:  # whatever else it is, it comes from what the file holds
+        raise BundleCorrupt(f"{path.name} cannot be parsed; export the model anew.") from error

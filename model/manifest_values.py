@@ -12,7 +12,7 @@ GROUPS = {
     "usual": ("misfit_mm", "misfit_exponent", "surface_sd_mm", "surface_sd_exponent"),
     "posterior": ("sd_scale", "offset_mm"),
     "typical": (
-        "freedom", "density_mean", "density_sd", "misfit_mean", "misfit_sd", "misfit_exponent",
+        "freedom", "density_peak", "rarity_mean", "rarity_sd", "misfit_mean", "misfit_sd", "misfit_exponent",
         "slice_mean", "slice_sd",
     ),
 }  # fmt: skip

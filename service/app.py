@@ -2,10 +2,8 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Iterable
-from contextlib import AbstractContextManager, asynccontextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager, nullcontext, suppress
 from functools import partial
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as installed_version
 from typing import Any
 
 from fastapi import FastAPI
@@ -14,15 +12,15 @@ from fastapi.routing import APIRoute
 from fastapi_offline import FastAPIOffline
 
 from model.inference.modes import shape_modes
-from service.adapters.images import ImageLimits, read_masks, write_nifti
+from service.adapters.images import write_nifti
 from service.adapters.mesh_formats import write_mesh
 from service.adapters.per_model import PerModel
 from service.adapters.processes import compute_here
 from service.adapters.workers import WorkerPool
 from service.extras import require_extra
 from service.model_registry import ModelRegistry, load_registry
-from service.observability import Log, Metrics, make_log
-from service.ports import Compute, MaskReader
+from service.observability import Log, Metrics, going_on, make_log
+from service.ports import Compute
 from service.routes.comparisons import comparisons_router
 from service.routes.dependencies import Services
 from service.routes.jobs import jobs_router
@@ -36,6 +34,7 @@ from service.routes.planes import planes_router
 from service.routes.posterior import posterior_router
 from service.routes.problems import install_handlers
 from service.routes.reconstructions import reconstructions_router
+from service.routes.redirects import RelativeRedirects
 from service.routes.results import results_router
 from service.routes.samples import samples_router
 from service.routes.stow import stow_router
@@ -43,6 +42,7 @@ from service.routes.turns import Turns
 from service.schemas import Problem, SurfaceSd
 from service.settings import Settings
 from service.stores import open_blobs, open_jobs, open_results
+from service.wiring import mask_reader
 
 TITLE = "MorphoFlow"
 #: Of the interface, not of the program: the second figure rises with additions, the first with breaks.
@@ -70,7 +70,8 @@ def create_app(
         log: where log entries go; standard error when None.
     """
     engine = WorkerPool(settings.workers, settings.max_waiting)
-    blobs, jobs = open_blobs(settings), open_jobs(settings)
+    log = log or make_log(settings.log_level)
+    blobs, jobs = open_blobs(settings), open_jobs(settings, log)
     store = open_results(settings, blobs)
     services = Services(
         settings=settings,
@@ -86,7 +87,7 @@ def create_app(
         turns=Turns(),
         blobs=blobs,
         metrics=Metrics(engine, jobs),
-        log=log or make_log(settings.log_level),
+        log=log,
     )
     pacs = _open_pacs(services)
     app = FastAPIOffline(
@@ -95,12 +96,13 @@ def create_app(
         title=TITLE,
         version=INTERFACE_VERSION,
         description=DESCRIPTION,
-        lifespan=partial(_lifespan, services=services, pacs=pacs, sweep=store.sweep, close=(engine.close, jobs.close)),
+        lifespan=partial(_lifespan, services=services, pacs=pacs, sweep=store.sweep, close=(jobs.close, engine.close)),
     )
     app.state.services = services
     app.state.pacs = pacs
     _add_routes(app)
     install_handlers(app, settings.retry_after_s)
+    app.add_middleware(RelativeRedirects)
     app.add_middleware(HeadMiddleware)
     app.add_middleware(BodyLimitMiddleware, max_bytes=settings.max_body_bytes)
     app.add_middleware(KeyMiddleware, keys=settings.keys)
@@ -128,20 +130,6 @@ def interface_document() -> dict[str, Any]:
     )
     _add_routes(app)
     return app.openapi()
-
-
-def mask_reader(settings: Settings) -> MaskReader:
-    """The reader of masks with the limits of the settings."""
-    limits = ImageLimits(max_bytes=settings.max_body_bytes, max_voxels=settings.max_voxels)
-    return lambda data, part, labels: read_masks(data, part, limits, labels)
-
-
-def program_version() -> str:
-    """Version of the installed program."""
-    try:
-        return installed_version("morphoflow")
-    except PackageNotFoundError:
-        return "0+unknown"
 
 
 def operation_name(route: APIRoute) -> str:
@@ -205,31 +193,35 @@ async def _lifespan(
     sweep: Callable[[], int],
     close: Iterable[Callable[[], None]],
 ) -> AsyncIterator[None]:
+    _tell_models("started", services)
+    async with AsyncExitStack() as leaving:
+        leaving.callback(services.log.info, "stopped")
+        for end in close:
+            leaving.callback(end)
+        leaving.push_async_callback(_cancelled, asyncio.create_task(_keep_up(sweep, services)))
+        leaving.enter_context(pacs)
+        yield
+
+
+def _tell_models(event: str, services: Services) -> None:
     for broken in services.registry.broken:
         services.log.error("broken model", model=broken.name, reason=broken.reason)
-    services.log.info("started", models=services.registry.names())
-    sweeper = asyncio.create_task(_sweep_for_ever(sweep, services))
-    try:
-        with pacs:
-            yield
-    finally:
-        sweeper.cancel()
-        with suppress(asyncio.CancelledError):
-            await sweeper
-        for end in close:
-            end()
-        services.log.info("stopped")
+    services.log.info(event, models=services.registry.names())
 
 
-async def _sweep_for_ever(sweep: Callable[[], int], services: Services) -> None:
+async def _cancelled(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    with suppress(asyncio.CancelledError):
+        await task
+
+
+async def _keep_up(sweep: Callable[[], int], services: Services) -> None:
+    """Sweep results and find models anew, turn after turn, whatever becomes of one."""
     while True:
-        try:
-            removed = await asyncio.to_thread(sweep)
-        except OSError:
-            services.log.warning("the results' folder cannot be swept")
-        else:
-            if removed:
+        with going_on(services.log, "the results' folder cannot be swept"):
+            if removed := await asyncio.to_thread(sweep):
                 services.log.info("expired results removed", count=removed)
-        if await asyncio.to_thread(services.registry.refresh):
-            services.log.info("models reloaded", models=services.registry.names())
+        with going_on(services.log, "models cannot be found anew"):
+            if await asyncio.to_thread(services.registry.refresh):
+                _tell_models("models reloaded", services)
         await asyncio.sleep(services.settings.sweep_interval_s)

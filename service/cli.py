@@ -3,8 +3,11 @@
 Exit status: 0 done, 2 the input is at fault (one sentence on standard error), 1 a fault of the program.
 """
 
+import signal
+import socket
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -17,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from model.errors import CohortError, InputError, MorphoFlowError, NotFound
 from service.adapters.processes import spread
-from service.app import create_app, interface_document, program_version
+from service.app import create_app, interface_document
 from service.commands import OpenRegistry, models, reconstruct, sample
 from service.console import writing
 from service.dicom_commands import audit, deidentify
@@ -25,9 +28,11 @@ from service.extras import install_line, require_extras
 from service.job_commands import jobs_commands
 from service.jobs.worker import run_worker, supervised_workers
 from service.mode_commands import modes
-from service.model_registry import load_registry
-from service.observability import make_log, uvicorn_logging
+from service.model_registry import ModelRegistry, load_registry
+from service.observability import Log, log_everything
 from service.settings import Settings, load_settings, require_protection
+from service.stores import require_places
+from service.wiring import program_version
 
 PROGRAM = "morphoflow"
 #: Packages that bring further commands register a callable that takes the typer application.
@@ -35,6 +40,8 @@ COMMAND_GROUP = "morphoflow.commands"
 BAD_INPUT, FAULT = 2, 1
 #: An idle connection stays open so long (s): longer than at a load balancer, which would send into a closing one.
 KEEP_ALIVE_S = 75
+#: Requests that run when the server is told to end have so long (s) to be answered.
+DRAIN_S = 30
 
 VersionOption = Annotated[bool, typer.Option("--version", help="Print the version.")]
 
@@ -112,25 +119,61 @@ def serve(
     settings = load_settings({name: value for name, value in given.items() if value is not None})
     require_protection(settings)
     require_extras(settings)
+    require_places(settings)
+    log = log_everything(settings.log_level)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # the server calls it once it has left
     registry = context.obj(settings)
     helping = settings.model_copy(update={"threads": settings.threads or 1})
-    example = example_request(settings, registry.names())
-    typer.echo(f"A request from another terminal, with a mask file of yours:\n\n  {example}\n", err=True)
+    _tell_example(log, example_request(settings, registry.names()))
     with (
-        spread(settings.workers - 1, partial(load_registry, helping)) as compute,
-        supervised_workers(settings.job_workers, make_log(settings.log_level)),
+        spread(settings.workers - 1, partial(_models_of_helper, helping), log) as compute,
+        supervised_workers(settings.job_workers, log) as end_workers,
     ):
-        uvicorn.run(
-            create_app(settings, registry=registry, compute=compute),
+        config = uvicorn.Config(
+            create_app(settings, registry=registry, compute=compute, log=log),
             host=settings.host,
             port=settings.port,
             root_path=settings.root_path,
             access_log=False,
-            log_config=uvicorn_logging(settings.log_level),
+            log_config=None,
             server_header=False,
-            timeout_graceful_shutdown=30,
+            timeout_graceful_shutdown=DRAIN_S,
             timeout_keep_alive=KEEP_ALIVE_S,
         )
+        _run(_Server(config, end_workers))
+
+
+class _Server(uvicorn.Server):
+    """A server that lets others begin to leave when it does, and not when it has left."""
+
+    def __init__(self, config: uvicorn.Config, leave: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._leave = leave
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Answer what was begun, for `DRAIN_S` at most."""
+        self._leave()
+        await super().shutdown(sockets)
+
+
+def _run(server: uvicorn.Server) -> None:
+    with suppress(KeyboardInterrupt):  # that is how a server ends that is told to from the keyboard
+        server.run()
+    if not server.started:
+        raise typer.Exit(FAULT)
+
+
+def _models_of_helper(settings: Settings) -> ModelRegistry:
+    log_everything(settings.log_level)
+    return load_registry(settings)
+
+
+def _tell_example(log: Log, example: str) -> None:
+    """A request to begin with: for a person at a terminal, else as an entry of the log like all others."""
+    if sys.stderr.isatty():
+        typer.echo(f"A request from another terminal, with a mask file of yours:\n\n  {example}\n", err=True)
+    else:
+        log.info("example", request=example)
 
 
 def worker(
@@ -141,8 +184,10 @@ def worker(
     """Do jobs until told to stop."""
     settings = load_settings()
     require_extras(settings)
+    require_places(settings)
+    log = log_everything(settings.log_level)
     settings = settings.model_copy(update={"threads": settings.threads or 1})
-    run_worker(settings, context.obj(settings), slot, attached=attached)
+    run_worker(settings, context.obj(settings), slot, log, attached=attached)
 
 
 def openapi(

@@ -23,7 +23,6 @@ from service.adapters.images import write_nifti
 from service.adapters.mesh_formats import write_mesh
 from service.adapters.processes import spread
 from service.adapters.sample_files import MANIFEST, Draw, SampleFile, SampleWriter, make_sample, manifest_bytes
-from service.app import mask_reader
 from service.console import echo_json, in_order, progress, require_free, require_suffix, writing
 from service.model_registry import ModelRegistry, load_registry
 from service.ports import Compute, MeshFormat, Outcome, SampleFormat
@@ -31,6 +30,7 @@ from service.presentation import model_summary, summary_of
 from service.request_schemas import parse_annotated, parse_labels
 from service.schemas import EstimateSchema, ModelList, Summary
 from service.settings import Settings, load_settings
+from service.wiring import mask_reader
 
 #: Suffix of volumes that commands write.
 NIFTI_SUFFIX = "nii.gz"
@@ -127,7 +127,11 @@ def sample(
             manifest = _sample_to_zip(batch, output)
         else:
             manifest = _sample_to_folder(batch, output, force=force)
-    typer.echo(manifest.decode() if as_json else f"{count} shapes of {chosen.manifest.name} written.")
+    typer.echo(
+        manifest.decode()
+        if as_json
+        else f"{count} {'shape' if count == 1 else 'shapes'} of {chosen.manifest.name} written."
+    )
 
 
 def models(context: typer.Context, as_json: JsonOption = False) -> None:
@@ -149,9 +153,7 @@ def _read(settings: Settings, masks: list[Path], labels: frozenset[int] | None) 
     read = mask_reader(settings)
     for number, path in enumerate(masks):
         if not path.is_file():
-            raise InvalidParameter(
-                f"mask[{number}] must be a file; there is none of this name.", part=f"mask[{number}]"
-            )
+            raise InvalidParameter(f"Each MASK must be a file; there is no file {path}.", part=f"mask[{number}]")
     return tuple(stack for number, path in enumerate(masks) for stack in read(path, f"mask[{number}]", labels))
 
 

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,14 +23,14 @@ T = TypeVar("T")
 
 @contextmanager
 def progress(total: int) -> Iterator[Watch]:
-    """A bar on standard error that moves on at each call with the next step's name; silent in a pipe."""
+    """A bar on standard error that is told the name of each step as it begins; silent in a pipe."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task("", total=total + 1, completed=-1)
+        task, done = bar.add_task("", total=total), count()
 
         def step(name: str) -> None:
-            bar.update(task, description=name, advance=1)
+            bar.update(task, description=name, completed=next(done))
 
         yield step
 

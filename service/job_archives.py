@@ -1,11 +1,11 @@
 """The masks of a ZIP that was sent: which of its members they are, and how much they may hold together."""
 
-import io
 import zipfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
 from model.errors import InvalidParameter, TooLarge
 
@@ -43,14 +43,14 @@ class ArchivedMask:
     problem: str | None = None
 
 
-def open_archive(archive: bytes) -> zipfile.ZipFile:
+def open_archive(archive: BinaryIO) -> zipfile.ZipFile:
     """The archive with the list of its members read.
 
     Raises:
         InvalidParameter: not a ZIP, or one whose list of members is damaged.
     """
     try:
-        return zipfile.ZipFile(io.BytesIO(archive))
+        return zipfile.ZipFile(archive)
     except _DAMAGED:
         raise InvalidParameter("The part archive must be a ZIP that is whole.", part="archive") from None
 
@@ -68,7 +68,7 @@ def masks_of(opened: zipfile.ZipFile, limits: ArchiveLimits) -> list[zipfile.Zip
     return found
 
 
-def masks_in(archive: bytes, limits: ArchiveLimits) -> Iterator[ArchivedMask]:
+def masks_in(archive: BinaryIO, limits: ArchiveLimits) -> Iterator[ArchivedMask]:
     """The masks of an archive, one in memory at a time; one at fault stops no other.
 
     Raises:
@@ -83,14 +83,12 @@ def masks_in(archive: bytes, limits: ArchiveLimits) -> Iterator[ArchivedMask]:
             yield mask
 
 
-def zip_of_folder(folder: Path) -> bytes:
-    """The masks below a folder as a ZIP, under their names relative to it."""
-    target = io.BytesIO()
+def zip_of_folder(folder: Path, target: BinaryIO) -> None:
+    """Write the masks below a folder as a ZIP, under their names relative to it."""
     with zipfile.ZipFile(target, "w") as archive:
         for path in sorted(folder.rglob("*")):
             if path.is_file() and path.name.lower().endswith(MASK_SUFFIXES) and not path.name.startswith("."):
                 archive.write(path, path.relative_to(folder).as_posix())
-    return target.getvalue()
 
 
 def _require_room(size: int, limits: ArchiveLimits) -> None:

@@ -3,9 +3,10 @@
 import time
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from tempfile import TemporaryFile
+from typing import Annotated, Any, BinaryIO
 
 import typer
 
@@ -37,6 +38,7 @@ from service.stores import open_blobs, open_jobs
 _POLL_S = 0.5
 
 OutputOption = Annotated[Path | None, typer.Option(help="ZIP to write; waits for the job. Left out: only begins it.")]
+ResultOption = Annotated[Path | None, typer.Option(help="ZIP to write once the job is done.")]
 KeyOption = Annotated[str | None, typer.Option(help="The same key with the same kind leads to the same job.")]
 IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Identifier of the job.")]
 
@@ -71,8 +73,8 @@ def sample_job(
     chosen = context.obj(settings).get(model)
     use_cases.batch_seeds(seed, count, settings.max_job_samples)
     require_step(chosen, spacing_mm, settings.max_voxels)
-    argument = {
-        "model": pinned_name(chosen),
+    asked = {
+        "model": model,
         "count": count,
         "seed": seed,
         "format": format.value,
@@ -80,7 +82,7 @@ def sample_job(
         "spacing_mm": spacing_mm,
         "reject": reject,
     }
-    _begin(settings, SAMPLES_JOB, argument, None, key, output, as_json=as_json)
+    _begin(settings, (SAMPLES_JOB, asked, ()), pinned_name(chosen), key, output, as_json=as_json)
 
 
 def reconstruct_job(
@@ -108,8 +110,8 @@ def reconstruct_job(
     settings = load_settings()
     chosen = context.obj(settings).get(model)
     require_step(chosen, resolution_mm, settings.max_voxels, part="resolution_mm")
-    argument = {
-        "model": pinned_name(chosen),
+    asked = {
+        "model": model,
         "format": format.value,
         "label": label or [],
         "annotated": annotated,
@@ -120,44 +122,39 @@ def reconstruct_job(
         "fidelity": fidelity,
         "extents": extents,
     }
-    archive = _archive(masks)
-    require_archive(archive, parse_annotated(annotated), settings.archive_limits)
-    _begin(settings, RECONSTRUCTIONS_JOB, argument, archive, key, output, as_json=as_json)
+    with _archive(masks) as archive:
+        require_archive(archive, parse_annotated(annotated), settings.archive_limits)
+        job = RECONSTRUCTIONS_JOB, asked, (archive,)
+        _begin(settings, job, pinned_name(chosen), key, output, as_json=as_json)
 
 
-def watch_job(identifier: IdArgument, output: OutputOption = None, force: ForceOption = False) -> None:
+def watch_job(identifier: IdArgument, output: ResultOption = None, force: ForceOption = False) -> None:
     """Follow a job to its end; --output writes what it made."""
     require_free({"--output": output}, force=force)
     settings = load_settings()
-    jobs, blobs = open_jobs(settings), open_blobs(settings)
-    _finish(jobs, blobs, jobs.status(identifier), output, as_json=False)
+    with closing(open_jobs(settings)) as jobs:
+        _finish(jobs, open_blobs(settings), jobs.status(identifier), output, as_json=False)
 
 
 def cancel_job(identifier: IdArgument, as_json: JsonOption = False) -> None:
     """Stop a job."""
-    jobs = open_jobs(load_settings())
-    _tell(jobs.cancel(identifier), as_json=as_json)
-    jobs.close()
+    with closing(open_jobs(load_settings())) as jobs:
+        _tell(jobs.cancel(identifier), as_json=as_json)
 
 
-def _begin(
-    settings: Settings,
-    kind: str,
-    argument: dict[str, Any],
-    archive: bytes | None,
-    key: str | None,
-    output: Path | None,
-    *,
-    as_json: bool,
-) -> None:
-    jobs, blobs = open_jobs(settings), open_blobs(settings)
-    inputs = () if archive is None else (archive,)
-    status = JobDesk(jobs, blobs, settings.max_jobs).submit(kind, argument, inputs, key)
-    if output is None:
-        _tell(status, as_json=as_json)
-        return
-    with _someone_works(settings, jobs.workers(settings.job_lease_s)):
-        _finish(jobs, blobs, status, output, as_json=as_json)
+#: A job's kind, its argument as it was asked for, and its inputs.
+Job = tuple[str, dict[str, Any], tuple[BinaryIO, ...]]
+
+
+def _begin(settings: Settings, job: Job, model: str, key: str | None, output: Path | None, *, as_json: bool) -> None:
+    blobs = open_blobs(settings)
+    with closing(open_jobs(settings)) as jobs:
+        status = JobDesk(jobs, blobs, settings.max_jobs).submit(*job, key, model=model)
+        if output is None:
+            _tell(status, as_json=as_json)
+            return
+        with _someone_works(settings, jobs.workers(settings.job_lease_s)):
+            _finish(jobs, blobs, status, output, as_json=as_json)
 
 
 @contextmanager
@@ -177,7 +174,6 @@ def _finish(jobs: JobEngine, blobs: BlobStore, status: JobStatus, output: Path |
         with writing("--output"), zipfile.ZipFile(output, "w") as archive:
             write_zip(archive, JobFiles(blobs, status.id), status.kind, status.result["count"])
     _tell(status, as_json=as_json)
-    jobs.close()
     if status.state is not JobState.DONE:
         raise NotReady(status.problem or f"The job has no result: it is {status.state.value}.")
 
@@ -189,9 +185,11 @@ def _tell(status: JobStatus, *, as_json: bool) -> None:
         typer.echo(f"{status.id} {status.state.value}: {status.done} of {status.total or '?'}")
 
 
-def _archive(masks: Path) -> bytes:
-    if masks.is_dir():
-        return zip_of_folder(masks)
-    if masks.is_file():
-        return masks.read_bytes()
-    raise InvalidParameter("MASKS must be a folder or a ZIP that exists.", part="MASKS")
+@contextmanager
+def _archive(masks: Path) -> Iterator[BinaryIO]:
+    if not masks.exists():
+        raise InvalidParameter("MASKS must be a folder or a ZIP that exists.", part="MASKS")
+    with TemporaryFile() if masks.is_dir() else masks.open("rb") as archive:
+        if masks.is_dir():
+            zip_of_folder(masks, archive)
+        yield archive

@@ -3,8 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from service.errors import UnknownResult
 from service.job_ports import BlobStore, Record
@@ -35,17 +34,18 @@ class JobFiles:
         self._blobs = blobs
         self._root = f"{_ROOT}/{job}"
 
-    def put_input(self, number: int, content: bytes | Path, submission: str = "") -> None:
+    def put_input(self, number: int, content: bytes | BinaryIO, submission: str = "") -> None:
         """Keep what the caller sent.
 
         Args:
+            content: a file is read from its beginning and may be closed by this.
             submission: name of this attempt where several may want to make the same job; each keeps its own.
         """
         key = self._input(number, submission)
-        if isinstance(content, Path):
-            self._blobs.put_file(key, content)
-        else:
+        if isinstance(content, bytes):
             self._blobs.put(key, content)
+        else:
+            self._blobs.put_file(key, content)
 
     def input(self, number: int, submission: str = "") -> bytes:
         """What the caller sent."""

@@ -4,8 +4,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol
 
 from model.interruption import Check
 
@@ -171,8 +170,8 @@ class BlobStore(Protocol):
         """Write a file, over an older one."""
         ...
 
-    def put_file(self, key: str, path: Path) -> None:
-        """Write a copy of a file on disk."""
+    def put_file(self, key: str, file: BinaryIO) -> None:
+        """Write a copy of an open file from its beginning, never all of it in memory; may close the file."""
         ...
 
     def get(self, key: str) -> bytes:

@@ -11,6 +11,7 @@ def job_summary(status: JobStatus, prefix: str = "", now: datetime | None = None
     """The wire form of a job; `prefix` is a proxy's."""
     place = f"{prefix}/v1/jobs/{status.id}"
     result = f"{prefix}/v1/reconstructions/{status.id}" if status.kind == RECONSTRUCTION_JOB else f"{place}/result"
+    is_there = status.state is JobState.DONE and status.result is not None
     remaining = status.remaining_s(now or datetime.now(UTC))
     return JobSummary(
         id=status.id,
@@ -23,5 +24,5 @@ def job_summary(status: JobStatus, prefix: str = "", now: datetime | None = None
         total=status.total,
         remaining_s=None if remaining is None else round(remaining, 1),
         problem=status.problem,
-        links=JobLinks(self=place, events=f"{place}/events", result=result if status.state is JobState.DONE else None),
+        links=JobLinks(self=place, events=f"{place}/events", result=result if is_there else None),
     )

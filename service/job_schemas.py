@@ -4,7 +4,7 @@ from datetime import datetime
 from typing import Any, Literal
 
 from fastapi import UploadFile
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from model.errors import InvalidParameter
 from model.inference.calipers import USUAL_TEXT, parse_extents
@@ -47,17 +47,22 @@ class JobForm(BaseModel):
     fidelity: float | None = Field(None, ge=0.0, le=1.0, description="of reconstructions: as of a single one")
     extents: str = Field(USUAL_TEXT, description="of reconstructions: as of a single one")
 
-    def argument(self, model: str) -> dict[str, Any]:
-        """The job's argument, checked, with the model that it was given to.
+    @field_validator("label")
+    @classmethod
+    def _leave_out_blank(cls, texts: list[str]) -> list[str]:
+        return [text for text in texts if text.strip()]
+
+    def argument(self) -> dict[str, Any]:
+        """The job's argument, checked, with the model as it was asked for.
 
         Raises:
             InvalidParameter: a part belongs to the other kind, is missing, or out of its range.
         """
         other = _OF_RECONSTRUCTIONS if self.kind == SAMPLES_JOB else _OF_SAMPLES
         for name in other:
-            if name in self.model_fields_set:
+            if name in self.model_fields_set and getattr(self, name) != []:  # blank labels, as forms of pages send them
                 raise InvalidParameter(f"The parameter {name} is of no use to a job of kind {self.kind}.", part=name)
-        shared = {"model": model, "format": self.format.value, "seed": self.seed}
+        shared = {"model": self.model, "format": self.format.value, "seed": self.seed}
         return {**shared, **(self._samples() if self.kind == SAMPLES_JOB else self._reconstructions())}
 
     def _samples(self) -> dict[str, Any]:
@@ -81,7 +86,7 @@ class JobLinks(BaseModel):
 
     self: str
     events: str
-    result: str | None = Field(description="what it made, once it is done")
+    result: str | None = Field(description="what it made, from when it is done until that is gone")
 
 
 class JobSummary(BaseModel):
@@ -96,5 +101,5 @@ class JobSummary(BaseModel):
     done: int = Field(description="items that are made")
     total: int = Field(description="items in all; 0 until it is known")
     remaining_s: float | None = Field(description="estimated time to its end (s); null while nothing is known")
-    problem: str | None = Field(description="why it failed")
+    problem: str | None = Field(description="why it failed, or that what it made is gone")
     links: JobLinks

@@ -5,7 +5,7 @@ import json
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, BinaryIO
 
 from model.errors import InvalidParameter
 from model.inference.annotated_planes import check_stacks
@@ -15,6 +15,8 @@ from service.job_archives import ArchiveLimits, masks_of, open_archive
 from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobStatus
 
+#: Bytes of what was sent that are in memory at the same time.
+_PIECE = 1 << 20
 #: Member of a job's argument: SHA-256 of everything that was asked for.
 _FINGERPRINT = "fingerprint"
 #: Member of a job's argument: whose inputs are the job's. Empty where no other request can want the same job, and not
@@ -35,16 +37,27 @@ class JobDesk:
     max_jobs: int
 
     def submit(
-        self, kind: str, argument: Mapping[str, Any], inputs: Sequence[bytes] = (), key: str | None = None
+        self,
+        kind: str,
+        asked: Mapping[str, Any],
+        inputs: Sequence[BinaryIO] = (),
+        key: str | None = None,
+        *,
+        model: str,
     ) -> JobStatus:
-        """Make a job, or find the one that the same key has made.
+        """Make a job, or find the one that the same key has made for the same request.
+
+        Args:
+            asked: the job's argument with the model as it was asked for, which a later release of it leaves as it is.
+            inputs: what was sent with it; read from its beginning, and may be closed by this.
+            model: the one that the job is given to.
 
         Raises:
             InvalidParameter: the key has made a job for another request.
             Overloaded: as many jobs wait or run as may.
             StoreFull: the inputs cannot be kept.
         """
-        fingerprint = _fingerprint(argument, inputs)
+        fingerprint = _fingerprint(asked, inputs)
         identifier = self.jobs.new_id(kind, key)
         found = self._found(identifier) if key is not None else None
         if found is not None:
@@ -53,7 +66,8 @@ class JobDesk:
             raise Overloaded("As many jobs wait as this service accepts; send the request again later.")
         submission = "" if key is None else uuid.uuid4().hex
         self._keep(identifier, inputs, submission)
-        made = self.jobs.enqueue(kind, {**argument, _FINGERPRINT: fingerprint, SUBMISSION: submission}, identifier)
+        argument = {**asked, "model": model, _FINGERPRINT: fingerprint, SUBMISSION: submission}
+        made = self.jobs.enqueue(kind, argument, identifier)
         if made.argument.get(SUBMISSION, "") != submission:  # another request of the same key was faster
             JobFiles(self.blobs, identifier).remove_inputs(submission)
         return _of_same_request(made, fingerprint)
@@ -64,11 +78,11 @@ class JobDesk:
         except UnknownJob:
             return None
 
-    def _keep(self, identifier: str, inputs: Sequence[bytes], submission: str) -> None:
+    def _keep(self, identifier: str, inputs: Sequence[BinaryIO], submission: str) -> None:
         files = JobFiles(self.blobs, identifier)
         try:
-            for number, data in enumerate(inputs):
-                files.put_input(number, data, submission)
+            for number, file in enumerate(inputs):
+                files.put_input(number, file, submission)
         except OSError as fault:
             files.remove_inputs(submission)
             raise StoreFull("What was sent cannot be kept now; send the request again later.") from fault
@@ -80,7 +94,7 @@ def require_stacks(annotated: AnnotatedRule | Sequence[Plane], count: int) -> No
         check_stacks(annotated, count)
 
 
-def require_archive(archive: bytes, annotated: AnnotatedRule | Sequence[Plane], limits: ArchiveLimits) -> None:
+def require_archive(archive: BinaryIO, annotated: AnnotatedRule | Sequence[Plane], limits: ArchiveLimits) -> None:
     """Refuse an archive that cannot be unpacked, before a job is made of it.
 
     Raises:
@@ -100,8 +114,16 @@ def _of_same_request(found: JobStatus, fingerprint: str) -> JobStatus:
     return found
 
 
-def _fingerprint(argument: Mapping[str, Any], inputs: Sequence[bytes]) -> str:
-    digest = hashlib.sha256(json.dumps(argument, sort_keys=True).encode())
-    for data in inputs:
-        digest.update(hashlib.sha256(data).digest())
+def _fingerprint(asked: Mapping[str, Any], inputs: Sequence[BinaryIO]) -> str:
+    digest = hashlib.sha256(json.dumps(asked, sort_keys=True).encode())
+    for file in inputs:
+        digest.update(_digest(file))
     return digest.hexdigest()
+
+
+def _digest(file: BinaryIO) -> bytes:
+    file.seek(0)
+    digest = hashlib.sha256()
+    while piece := file.read(_PIECE):
+        digest.update(piece)
+    return digest.digest()

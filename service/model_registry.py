@@ -4,8 +4,10 @@ A model that cannot be opened is kept with its sentence and does not stop the ot
 stand side by side: ``name`` is the newest one, ``name@version`` a certain one.
 """
 
+import errno
+import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -87,15 +89,18 @@ def pinned_name(model: ShapeModel) -> str:
 
 
 def load_models(folders: Iterable[Path], open_model: Callable[[Path], ShapeModel]) -> ModelRegistry:
-    """Open every bundle of the folders; of two with one name and version the first stays."""
+    """Open every bundle of the folders; of two with one name and version the first stays.
+
+    Raises:
+        OSError: this process has no more files to open, of which no bundle is the cause.
+    """
     models: dict[str, ShapeModel] = {}
     broken: list[BrokenModel] = []
     for folder in folders:
         try:
             model = open_model(folder)
         except (BundleError, OSError) as fault:
-            reason = str(fault) if isinstance(fault, BundleError) else "The bundle's folder cannot be read."
-            broken.append(BrokenModel(folder.name, reason))
+            broken.append(BrokenModel(folder.name, _reason(fault)))
             continue
         name = pinned_name(model)
         if name in models:
@@ -105,13 +110,23 @@ def load_models(folders: Iterable[Path], open_model: Callable[[Path], ShapeModel
     return ModelRegistry(models, broken)
 
 
+def _reason(fault: BundleError | OSError) -> str:
+    if isinstance(fault, BundleError):
+        return str(fault)
+    if fault.errno in (errno.EMFILE, errno.ENFILE):
+        raise fault
+    return "The bundle's folder cannot be read."
+
+
 def load_registry(settings: Settings) -> ModelRegistry:
     """The registry that the settings ask for."""
     shipped = (Path(str(resources.files("model"))) / "bundles",) if settings.shipped_models else ()
     once = OpenedOnce(lambda folder: open_bundle(folder, backend=settings.backend, threads=settings.threads))
 
     def load() -> ModelRegistry:
-        found = load_models([bundle for root in (*shipped, *settings.models) for bundle in find_bundles(root)], once)
+        bundles = [bundle for root in (*shipped, *settings.models) for bundle in find_bundles(root)]
+        found = load_models(bundles, once)
+        once.forget_all_but(bundles)
         return ModelRegistry(found._models, (*found.broken, *absent_folders(settings.models)))
 
     found = load()
@@ -133,20 +148,27 @@ class OpenedOnce:
             self._opened[folder] = content, self._open(folder)
         return self._opened[folder][1]
 
+    def forget_all_but(self, folders: Collection[Path]) -> None:
+        """Let go of the models of folders that are gone."""
+        for folder in self._opened.keys() - set(folders):
+            del self._opened[folder]
 
-def find_bundles(root: Path) -> Iterator[Path]:
-    """The folder itself when it is a bundle, else the folders in it; nothing when it is not there."""
-    if (root / MANIFEST).is_file():
-        yield root
-    elif root.is_dir():
-        yield from sorted(folder for folder in root.iterdir() if folder.is_dir() and not folder.name.startswith("."))
+
+def find_bundles(root: Path) -> list[Path]:
+    """The folder itself when it is a bundle, else the folders in it; none when it is not there or cannot be read."""
+    try:
+        if (root / MANIFEST).is_file():
+            return [root]
+        return sorted(folder for folder in root.iterdir() if folder.is_dir() and not folder.name.startswith("."))
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        return []
 
 
 def absent_folders(roots: Iterable[Path]) -> Iterator[BrokenModel]:
-    """What stands for the folders that are named and not there, or no folders."""
+    """What stands for the folders that are named and not there, cannot be read, or are no folders."""
     for root in roots:
-        if not root.is_dir():
-            yield BrokenModel(root.name, "MORPHOFLOW_MODELS names this folder, and there is none of this name.")
+        if not os.access(root, os.R_OK | os.X_OK) or not root.is_dir():
+            yield BrokenModel(root.name, "MORPHOFLOW_MODELS names this folder, and there is none to read of this name.")
 
 
 def _newest(models: Iterable[ShapeModel]) -> dict[str, ShapeModel]:

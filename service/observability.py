@@ -4,11 +4,16 @@ Neither holds a file name, a value of an image header, a query or the path of a 
 route as it stands in the interface, and of a fault where in the program it arose.
 """
 
+import logging
+import logging.config
 import re
 import sys
+import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
@@ -32,6 +37,10 @@ MOST_EXCEPTIONS, MOST_FRAMES = 16, 40
 _TRACE = "Traceback (most recent call last):\n"
 _FRAME = re.compile(r'^  File "(.+)", line (\d+), in (\S+)$', re.MULTILINE)
 _RAISED = re.compile(r"^[A-Za-z][\w.]*(?:Error|Exception)(?=:|$)", re.MULTILINE)
+#: Libraries whose messages hold nothing of requests in their first line.
+_SPEAKS = ("asyncio", "uvicorn")
+#: The same message of one place is written once in so long (s): a server without descriptors has one a connection.
+REPEATED_AFTER_S = 10.0
 #: The folder that holds this program's packages.
 _HOME = Path(__file__).parents[1]
 
@@ -51,6 +60,15 @@ def make_log(level: str, stream: TextIO | None = None) -> Log:
         ],
         wrapper_class=structlog.make_filtering_bound_logger(SEVERITIES[level]),
     )
+
+
+@contextmanager
+def going_on(log: Log, event: str) -> Iterator[None]:
+    """Log what fails in a turn of what is done again and again, and let the next turn come."""
+    try:
+        yield
+    except Exception as fault:
+        log.warning(event, exc_info=fault)
 
 
 def exception_told(exc_info: ExceptionInfo) -> list[dict[str, Any]]:
@@ -155,19 +173,76 @@ class StageTimer:
         self._stage = None
 
 
-def uvicorn_logging(level: str) -> dict[str, Any]:
-    """Logging of the HTTP server itself (standard library, `dictConfig`), as JSON like everything else."""
+def log_everything(level: str) -> Log:
+    """Write what this process says from here on to standard error as entries of a log, and give that log."""
+    log = make_log(level)
+    logging.config.dictConfig(library_logging(level))
+    warnings.showwarning = _warned(log)
+    sys.excepthook = lambda kind, error, trace: _ended(log, kind, error, trace)
+    threading.excepthook = lambda ended: _ended(log, ended.exc_type, ended.exc_value, ended.exc_traceback)
+    return log
+
+
+def library_logging(level: str) -> dict[str, Any]:
+    """Logging of the standard library (`dictConfig`): all of the HTTP server, and warnings of everything else."""
     stages = [
         structlog.stdlib.ProcessorFormatter.remove_processors_meta,
         structlog.processors.ExceptionRenderer(exception_told),
         structlog.processors.JSONRenderer(),
     ]
-    before = [structlog.stdlib.add_log_level, structlog.processors.TimeStamper(fmt="iso", utc=True)]
+    before = [structlog.stdlib.add_log_level, _without_contents, structlog.processors.TimeStamper(fmt="iso", utc=True)]
     formatter = {"()": structlog.stdlib.ProcessorFormatter, "processors": stages, "foreign_pre_chain": before}
+    handler = {"class": "logging.StreamHandler", "formatter": "json"}
     return {
         "version": 1,
         "disable_existing_loggers": False,
         "formatters": {"json": formatter},
-        "handlers": {"stderr": {"class": "logging.StreamHandler", "formatter": "json"}},
-        "loggers": {"uvicorn": {"handlers": ["stderr"], "level": level.upper(), "propagate": False}},
+        "filters": {"seldom": {"()": Seldom}},
+        "handlers": {"server": handler, "libraries": {**handler, "filters": ["seldom"]}},
+        "root": {"handlers": ["libraries"], "level": "WARNING"},
+        "loggers": {"uvicorn": {"handlers": ["server"], "level": level.upper(), "propagate": False}},
     }
+
+
+class Seldom(logging.Filter):
+    """Lets what one place says again and again pass once in `REPEATED_AFTER_S`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._passed: dict[tuple[str, int, str], float] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the record is written."""
+        origin = record.name, record.lineno, _first_line(record.getMessage())
+        if record.created < self._passed.get(origin, float("-inf")) + REPEATED_AFTER_S:
+            return False
+        self._passed = {one: at for one, at in self._passed.items() if at + REPEATED_AFTER_S > record.created}
+        self._passed[origin] = record.created
+        return True
+
+
+def _without_contents(_logger: object, _method: str, entry: dict[str, Any]) -> dict[str, Any]:
+    record: logging.LogRecord = entry["_record"]
+    said, library = str(entry["event"]), record.name.split(".")[0]
+    entry["event"], entry["logger"] = _first_line(said), record.name
+    if said.startswith(_TRACE):  # the server tells a fault at its start or end as text
+        entry["event"], entry["exc_info"] = "fault", RuntimeError(said)
+    elif library not in _SPEAKS:
+        entry.update(event="a library has a message", filename=_place(record.pathname), lineno=record.lineno)
+    return entry
+
+
+def _first_line(text: str) -> str:
+    return text.strip().partition("\n")[0]
+
+
+def _warned(log: Log) -> Any:
+    def show(_: object, category: type[Warning], filename: str, lineno: int, *_more: object) -> None:
+        log.warning("a library warns", category=category.__name__, filename=_place(filename), lineno=lineno)
+
+    return show
+
+
+def _ended(log: Log, kind: type[BaseException], error: BaseException | None, trace: TracebackType | None) -> None:
+    if error is not None and not issubclass(kind, KeyboardInterrupt | SystemExit):
+        log.error("fault", exc_info=(kind, error, trace))

@@ -55,10 +55,12 @@ class Retrieval:
     Attributes:
         images: headers without pixels, each once, in no order.
         failed: how many more the archive has and could not send.
+        fault: the archive's reason for that in a sentence, where it gave one.
     """
 
     images: Sequence[DicomObject]
     failed: int = 0
+    fault: str = ""
 
 
 class PictureArchive(Protocol):

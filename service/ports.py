@@ -115,7 +115,12 @@ class ResultStore(Protocol):
 
         Raises:
             UnknownResult: never kept, expired or deleted.
+            Overloaded: the storage does not answer, here and in what follows.
         """
+        ...
+
+    def has(self, identifier: str) -> bool:
+        """Whether an outcome is kept and has not expired, without reading it."""
         ...
 
     def delete(self, identifier: str) -> None:

@@ -11,7 +11,8 @@ from model.geometry import Space, ras_to
 from model.inference.estimates import Estimate, sd_of_estimate
 from model.inference.mask_stack import MaskStack, Plane, section_of
 from model.inference.next_plane import NextPlane
-from service.adapters.mesh_formats import RAMP
+from model.inference.reconstruction import SURFACE_SD
+from service.colours import RAMP
 from service.ports import Outcome, StoredResult
 from service.request_schemas import PlaneSchema
 from service.schemas import (
@@ -35,7 +36,6 @@ from service.schemas import (
     Summary,
     SurfaceSdSummary,
 )
-from service.use_cases import SURFACE_SD
 
 
 def summary_of(outcome: Outcome) -> Summary:

@@ -49,7 +49,8 @@ class ReconstructionForm(_Closed):
     )
     annotated: str = Field(
         "auto",
-        description='auto, all, nonempty, or a JSON list of planes such as [{"stack": 0, "axis": 2, "index": 7}]',
+        description='auto, all, nonempty, or a JSON list of planes such as [{"stack": 0, "axis": 2, "index": 7}]; '
+        "stack is 0 when left out",
     )
     uncertainty: Literal["laplace", "ensemble", "none"] = Field("laplace", description="how uncertainty is found")
     mirror: Literal["auto", "never", "always"] = Field("never", description="whether left and right are exchanged")
@@ -159,6 +160,10 @@ class PlaneSchema(_Closed):
     index: int = Field(ge=0, description="voxel index along the axis")
 
 
+class _AskedPlane(PlaneSchema):
+    stack: int = Field(0, ge=0)
+
+
 def parse_annotated(text: str) -> AnnotatedRule | tuple[Plane, ...]:
     """The `annotated` parameter.
 
@@ -169,7 +174,7 @@ def parse_annotated(text: str) -> AnnotatedRule | tuple[Plane, ...]:
         case "auto" | "all" | "nonempty" as rule:
             return rule
     try:
-        planes = [PlaneSchema.model_validate(item, strict=True) for item in json.loads(text)]
+        planes = [_AskedPlane.model_validate(item, strict=True) for item in json.loads(text)]
     except (ValueError, TypeError, RecursionError, ValidationError):
         planes = []
     if not planes:

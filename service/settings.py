@@ -5,9 +5,11 @@ Nothing is read at import; `load_settings` reads the environment once, when a pr
 
 import ipaddress
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import (
@@ -17,12 +19,19 @@ from pydantic_settings import (
     SettingsConfigDict,
     TomlConfigSettingsSource,
 )
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError
 
 from model.errors import InvalidParameter
 from service.job_archives import ArchiveLimits
 
 #: Names a TOML file with settings; the environment overrides it.
 SETTINGS_FILE_VARIABLE = "MORPHOFLOW_SETTINGS_FILE"
+
+#: A hundred years (s): dates of what is kept for longer may be beyond the last one that a calendar has.
+LONGEST_LIFETIME_S = 100 * 365 * 86400.0
+#: Kinds of databases that jobs may be kept in.
+DATABASES = ("postgresql", "postgres", "sqlite")
 
 
 def default_results_folder() -> Path:
@@ -33,7 +42,7 @@ def default_results_folder() -> Path:
 class Settings(BaseSettings):
     """All settings; each field is the environment variable ``MORPHOFLOW_<FIELD>``."""
 
-    model_config = SettingsConfigDict(env_prefix="MORPHOFLOW_", extra="forbid", frozen=True)
+    model_config = SettingsConfigDict(env_prefix="MORPHOFLOW_", extra="forbid", frozen=True, allow_inf_nan=False)
 
     host: str = Field("127.0.0.1", description="address to listen on")
     port: int = Field(8000, ge=1, le=65535, description="port to listen on")
@@ -51,9 +60,9 @@ class Settings(BaseSettings):
     )
     allow_open: bool = Field(False, description="allow to listen on a public address without a key")
     results_folder: Path = Field(default_factory=default_results_folder, description="where results are kept")
-    result_lifetime_s: float = Field(86400.0, gt=0, description="how long a result is served")
+    result_lifetime_s: float = Field(86400.0, gt=0, le=LONGEST_LIFETIME_S, description="how long a result is served")
     results_max_bytes: int = Field(10 * 2**30, ge=1, description="results kept together; the oldest go first")
-    sweep_interval_s: float = Field(60.0, gt=0, description="how often expired results are removed")
+    sweep_interval_s: float = Field(60.0, gt=0, le=86400.0, description="how often expired results are removed")
     max_body_bytes: int = Field(256 * 2**20, ge=1, description="largest request body")
     max_voxels: int = Field(2**27, ge=1, description="most voxels of a mask after decompression, and of an answer")
     max_masks: int = Field(8, ge=1, description="most mask parts of a request")
@@ -68,7 +77,9 @@ class Settings(BaseSettings):
     replica: str = Field("", description="name of this machine among the others; the host's when left out")
     job_workers: int = Field(1, ge=0, le=256, description="processes beside the service that do jobs")
     job_nice: int = Field(15, ge=0, le=19, description="how far jobs stand back behind requests (nice)")
-    job_lease_s: float = Field(10.0, ge=1.0, description="a job worker not seen for so long is taken for gone")
+    job_lease_s: float = Field(
+        10.0, ge=1.0, le=3600.0, description="a job worker not seen for so long is taken for gone"
+    )
     max_jobs: int = Field(64, ge=0, description="jobs that may wait or run")
     max_job_samples: int = Field(100_000, ge=1, description="most shapes of a job")
     max_job_masks: int = Field(10_000, ge=1, description="most masks of a job")
@@ -76,7 +87,7 @@ class Settings(BaseSettings):
     pacs_file: Path | None = Field(
         None, description="TOML file that says how the service stands among picture archives; no DICOM when left out"
     )
-    retry_after_s: int = Field(10, ge=1, description="when a refused client is told to come back")
+    retry_after_s: int = Field(10, ge=1, le=86400, description="when a refused client is told to come back")
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="least severe entry logged")
 
     @field_validator("models", mode="before")
@@ -88,6 +99,27 @@ class Settings(BaseSettings):
     @classmethod
     def _split_keys(cls, value: object) -> object:
         return tuple(filter(None, map(str.strip, value.split(",")))) if isinstance(value, str) else value
+
+    @field_validator("jobs_database")
+    @classmethod
+    def _require_database(cls, value: SecretStr) -> SecretStr:
+        if value.get_secret_value() and not _is_database(value.get_secret_value()):
+            raise ValueError("it must be postgresql://user@host/name, sqlite:////folder/file, or left out")
+        return value
+
+    @field_validator("storage_url")
+    @classmethod
+    def _require_bucket(cls, value: str) -> str:
+        if value and not re.fullmatch(r"s3://[A-Za-z0-9._-]+(/[^?#]*)?", value):
+            raise ValueError("it must be s3://bucket, s3://bucket/prefix, or left out")
+        return value
+
+    @field_validator("storage_endpoint")
+    @classmethod
+    def _require_address(cls, value: str) -> str:
+        if value and not _is_http_address(value):
+            raise ValueError("it must be an address such as http://host:port, or left out")
+        return value
 
     @classmethod
     def settings_customise_sources(
@@ -128,9 +160,27 @@ def load_settings(overrides: Mapping[str, Any] | None = None) -> Settings:
     except ValidationError as fault:
         first = fault.errors(include_input=False)[0]
         name = ".".join(map(str, first["loc"])) or "settings"
-        raise InvalidParameter(f"The setting {name} is not valid: {first['msg']}.", part=name) from None
+        reason = first["msg"].removeprefix("Value error, ")
+        raise InvalidParameter(f"The setting {name} is not valid: {reason}.", part=name) from None
     except ValueError:
         raise InvalidParameter(f"{SETTINGS_FILE_VARIABLE} must hold valid TOML.", part=SETTINGS_FILE_VARIABLE) from None
+
+
+def _is_database(url: str) -> bool:
+    """Whether an address names a database of a kind that jobs may be kept in."""
+    try:
+        place = make_url(url)
+    except (ArgumentError, ValueError):
+        return False
+    return place.get_backend_name() in DATABASES and bool(place.database)
+
+
+def _is_http_address(url: str) -> bool:
+    try:
+        place = urlsplit(url)
+        return place.scheme in ("http", "https") and bool(place.hostname) and place.port != 0
+    except ValueError:
+        return False
 
 
 def is_loopback(host: str) -> bool:

@@ -1,14 +1,21 @@
 """Where the settings say that results, files and jobs are kept: on this machine, or in a database and a bucket."""
 
+import os
 import socket
 from pathlib import Path
 
+import sqlalchemy as sa
+from sqlalchemy.engine import make_url
+
+from model.errors import InvalidParameter
 from service.adapters.blob_results import BlobResultStore
 from service.adapters.blobs import FolderBlobs
 from service.adapters.jobs.client import DbosJobs
+from service.adapters.jobs.database import is_postgres, open_engine
 from service.adapters.result_store import DiskResultStore
 from service.extras import require_extra
 from service.job_ports import BlobStore
+from service.observability import Log
 from service.settings import Settings
 
 
@@ -18,9 +25,9 @@ def jobs_url(settings: Settings) -> str:
     return given or f"sqlite:///{settings.results_folder.absolute().parent / 'jobs.sqlite'}"
 
 
-def open_jobs(settings: Settings) -> DbosJobs:
+def open_jobs(settings: Settings, log: Log | None = None) -> DbosJobs:
     """The engine of jobs; connects when it is first used."""
-    return DbosJobs(jobs_url(settings))
+    return DbosJobs(jobs_url(settings), log)
 
 
 def open_blobs(settings: Settings) -> BlobStore:
@@ -39,6 +46,49 @@ def open_results(settings: Settings, blobs: BlobStore) -> DiskResultStore | Blob
         return BlobResultStore(blobs, lifetime_s=settings.result_lifetime_s)
     folder: Path = settings.results_folder
     return DiskResultStore(folder, lifetime_s=settings.result_lifetime_s, max_bytes=settings.results_max_bytes)
+
+
+def require_places(settings: Settings) -> None:
+    """Refuse places that nothing can be kept in; one that is only away for now is waited for while the program runs.
+
+    Raises:
+        InvalidParameter: names the setting and says what it may be.
+    """
+    if not settings.storage_url and not _is_writable(settings.results_folder):
+        raise InvalidParameter(
+            "MORPHOFLOW_RESULTS_FOLDER must name a folder that this program may make or write to.",
+            part="results_folder",
+        )
+    name = missing_database(jobs_url(settings))
+    if name is not None:
+        raise InvalidParameter(
+            f"MORPHOFLOW_JOBS_DATABASE names the database {name}, which is not on its server; create it first.",
+            part="jobs_database",
+        )
+
+
+def _is_writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.R_OK | os.W_OK | os.X_OK)
+
+
+def missing_database(url: str) -> str | None:
+    """Name of a database that its server says it does not have; None when it has, or does not say."""
+    place = make_url(url)
+    if not is_postgres(url):
+        return None
+    everywhere = open_engine(place.set(database="postgres").render_as_string(hide_password=False))
+    query = sa.text("SELECT 1 FROM pg_database WHERE datname = :name")
+    try:
+        with everywhere.connect() as connection:
+            return None if connection.execute(query, {"name": place.database}).first() else place.database
+    except sa.exc.DBAPIError:
+        return None
+    finally:
+        everywhere.dispose()
 
 
 def replica_name(settings: Settings) -> str:

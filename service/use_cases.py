@@ -17,26 +17,19 @@ from model.inference.modes import ShapeModes, shape_along
 from model.inference.next_plane import Among, NextPlane
 from model.inference.next_plane import next_plane as best_plane
 from model.inference.observations import AnnotatedRule, MaskStack, Plane, find_planes
+from model.inference.one_body import OCCUPIED, of_one_body
 from model.inference.posterior_shapes import PosteriorShape, draw_posterior
-from model.inference.reconstruction import Options, Watch
+from model.inference.reconstruction import SURFACE_SD, Options, Watch, unwatched
 from model.inference.reconstruction import reconstruct as infer
 from model.inference.sampling import SampledShape, draw_shape
 from model.inference.surface import covering_grid, require_step
 from model.inference.uncertainty import ShapeState, occupancy, voxel_entropy
-from model.interruption import Check, interruptible
+from model.interruption import Check, interruptible, unchecked
 from service.errors import NotComputed
 from service.ports import Catalogue, ModeSource, Outcome
 
-#: A voxel belongs to the object from this probability on.
-OCCUPIED = 0.5
-#: Scalar of a mesh that holds the standard deviation of its surface along the normal (mm).
-SURFACE_SD = "surface_sd_mm"
 #: Largest seed; exact as a JSON number everywhere.
 MAX_SEED = 2**53 - 1
-
-
-def unchecked() -> None:
-    """A `Check` that lets everything pass."""
 
 
 def reconstruct(
@@ -44,7 +37,7 @@ def reconstruct(
     stacks: tuple[MaskStack, ...],
     options: Options,
     max_voxels: int | None = None,
-    watch: Watch = lambda stage: None,
+    watch: Watch = unwatched,
     check: Check = unchecked,
 ) -> Outcome:
     """Reconstruct the object of the stacks; the first one's grid is the input's grid.
@@ -86,7 +79,8 @@ def probability_map(
     mesh = outcome.reconstruction.mesh
     grid = outcome.grid if spacing_mm is None else covering_grid(mesh, spacing_mm)
     require_voxels(grid, max_voxels)
-    return Volume(occupancy(model, outcome.reconstruction.state, grid).astype(np.float32), grid)
+    probability = occupancy(model, outcome.reconstruction.state, grid)
+    return Volume(of_one_body(probability, grid, mesh).astype(np.float32), grid)
 
 
 def segmentation(
@@ -213,7 +207,7 @@ def label_map(model: ShapeModel, shape: SampledShape, spacing_mm: float, max_vox
     size = len(shape.latent) + 7
     fit = Fit(shape.latent, Pose(), FitStatus.CONVERGED, "Drawn, not fitted.", 0, 0.0, np.zeros((size, size)))
     probability = occupancy(model, ShapeState((fit,), None), grid)
-    return Volume((probability >= OCCUPIED).astype(np.uint8), grid)
+    return Volume((of_one_body(probability, grid, shape.mesh) >= OCCUPIED).astype(np.uint8), grid)
 
 
 def modes_of(model: ShapeModel, modes: ModeSource, check: Check = unchecked) -> ShapeModes:

@@ -3,11 +3,13 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float
 from scipy.integrate import quad
 from scipy.special import ellipeinc, ellipkinc
 
 from model.geometry import Grid
+from model.inference.mesh import Mesh, mesh_of
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,12 @@ class Box:
         """8 (ab + bc + ca)."""
         a, b, c = self.half_sizes
         return 8.0 * (a * b + b * c + c * a) / 100.0
+
+    @property
+    def surface(self) -> Mesh:
+        """Twelve triangles."""
+        solid = trimesh.creation.box(2.0 * np.array(self.half_sizes))
+        return mesh_of(np.array(solid.vertices) + self.centre, np.array(solid.faces))
 
     def logits(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Signed distance (mm), positive inside."""

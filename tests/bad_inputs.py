@@ -122,6 +122,12 @@ def bad_inputs() -> tuple[BadInput, ...]:
             suffix=".mha",
         ),
         BadInput("NRRD with an external file", _detached_nrrd, UnreadableImage, 415, suffix=".nrrd"),
+        BadInput("NRRD header by itself", lambda: [_detached_header()], UnreadableImage, 415, suffix=".nhdr"),
+        BadInput("65 axes", lambda: [many_axes_mha(65)], InvalidMask, 422, suffix=".mha"),
+        BadInput("5000 axes", lambda: [many_axes_mha(5000)], InvalidMask, 422, suffix=".mha"),
+        BadInput("65 axes, NRRD", lambda: [many_axes_nrrd(65)], InvalidMask, 422, suffix=".nrrd"),
+        BadInput("5000 axes, NRRD", lambda: [many_axes_nrrd(5000)], UnreadableImage, 415, suffix=".nrrd"),
+        BadInput("one slice in two files", lambda: [nifti(drawn(slices=(4,)))] * 2, InvalidMask, 422),
         BadInput("truncated NRRD", lambda: [nrrd_text("6 7 8")[:-1]], UnreadableImage, 415, suffix=".nrrd"),
         BadInput("truncated MetaImage", lambda: [mha_text()[:-1]], UnreadableImage, 415, suffix=".mha"),
         BadInput("NRRD header without end", lambda: [b"NRRD0004\ntype: uchar\n"], UnreadableImage, 415, suffix=".nrrd"),
@@ -222,6 +228,26 @@ def nrrd_text(
 
 def _detached_nrrd() -> list[bytes]:
     return [nrrd_text("6 7 8").replace(b"encoding:", b"data file: /etc/hostname\nencoding:")]
+
+
+def _detached_header() -> bytes:
+    """As writers of .nhdr leave it: the last field ends the file."""
+    return _detached_nrrd()[0].partition(b"\n\n")[0] + b"\n"
+
+
+def many_axes_mha(axes: int) -> bytes:
+    """A MetaImage of `drawn` with more axes, all of one voxel."""
+    text = mha_text(size="6 7 8" + " 1" * (axes - 3), spacing=" ".join(["1"] * axes)).replace(
+        b"NDims = 3", b"NDims = %d" % axes
+    )
+    return b"".join(
+        line for line in text.splitlines(keepends=True) if not line.startswith((b"Offset", b"TransformMatrix"))
+    )
+
+
+def many_axes_nrrd(axes: int) -> bytes:
+    """An NRRD of `drawn` with more axes, all of one voxel."""
+    return nrrd_text("6 7 8" + " 1" * (axes - 3)).replace(b"dimension: 3", b"dimension: %d" % axes)
 
 
 def mha_text(

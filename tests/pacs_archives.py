@@ -26,17 +26,20 @@ class FakeArchive:
         tls: of its port and of the associations that it asks for.
         before_moving: what happens when the port for moved images is open.
         withheld: how many of the images it fails to send.
-        stored: UIDs of results in the order in which they came.
+        answers_queries: whether it takes C-FIND.
+        stored: UIDs of results in the order in which they came, and the results.
         requests: Transaction UID and UIDs of the objects of each request.
     """
 
     images: Sequence[Dataset]
     withheld: int = 0
+    answers_queries: bool = True
     destination: MoveDestination | None = None
     tls: Tls | None = None
     before_moving: Callable[[], object] = lambda: None
     port: int = field(default_factory=lambda: free_ports(1)[0])
     stored: list[str] = field(default_factory=list)
+    results: list[Dataset] = field(default_factory=list)
     requests: list[tuple[str, list[str]]] = field(default_factory=list)
     asked: threading.Event = field(default_factory=threading.Event)
 
@@ -50,7 +53,8 @@ class FakeArchive:
         for context in AllStoragePresentationContexts:
             entity.add_supported_context(context.abstract_syntax, scu_role=True, scp_role=True)
         entity.requested_contexts = [build_context(uid) for uid in {image.SOPClassUID for image in self.images}]
-        for uid in (sop_classes.VERIFICATION, sop_classes.FIND, sop_classes.GET, sop_classes.MOVE):
+        queries = [sop_classes.FIND] if self.answers_queries else []
+        for uid in (sop_classes.VERIFICATION, sop_classes.GET, sop_classes.MOVE, *queries):
             entity.add_supported_context(uid)
         entity.add_supported_context(sop_classes.COMMITMENT)
         handlers: list[Any] = [
@@ -109,6 +113,7 @@ class FakeArchive:
 
     def _store(self, event: Any) -> int:
         self.stored.append(str(event.request.AffectedSOPInstanceUID))
+        self.results.append(event.dataset)
         return 0x0000
 
     def _action(self, event: Any) -> tuple[int, None]:

@@ -3,11 +3,11 @@
 import io
 import json
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pydicom import Dataset, dcmread
 
@@ -25,11 +25,11 @@ from service.jobs.drawings import DrawingTools, drawing_kind
 from service.model_registry import ModelRegistry
 from service.observability import make_log
 from service.pacs import silence_libraries
+from service.pacs_ports import PictureArchive, Retrieval
 from tests.analytic_model import ellipsoid_model
 from tests.dicom_parts import file_bytes, mr_series, seg_of
 from tests.service_parts import sparse_ellipsoid
-
-PATIENCE_S = 60.0
+from tests.waiting import until
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Service:
     folder: Path
     configuration: PacsConfiguration
     said: io.StringIO
+    open_archive: Callable[[Archive], PictureArchive] = open_archive
 
     def __post_init__(self) -> None:
         silence_libraries()
@@ -59,7 +60,7 @@ class Service:
     @contextmanager
     def working(self) -> Iterator[None]:
         registry = ModelRegistry({"ellipsoid": ellipsoid_model("ellipsoid")})
-        desk = Desk(self.configuration, self.blobs, self.audit, open_archive, "MORPHOFLOW")
+        desk = Desk(self.configuration, self.blobs, self.audit, self.open_archive, "MORPHOFLOW")
         limits = ImageLimits(max_bytes=1 << 24, max_voxels=1 << 22)
         kind = drawing_kind(DrawingTools(desk, registry, limits, "0.1.0", self.log))
         with running_worker([kind], WorkerOptions(self.url, "a-0"), self.log):
@@ -74,11 +75,27 @@ class Service:
         return [json.loads(self.blobs.get(key))["reason"] for key in keys]
 
 
-def until(holds: Callable[[], object]) -> None:
-    limit = time.monotonic() + PATIENCE_S
-    while not holds() and time.monotonic() < limit:
-        time.sleep(0.05)
-    assert holds()
+class Looks:
+    """Opens archives, and counts how often they were looked through for images."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def open(self, archive: Archive) -> PictureArchive:
+        return _WatchedArchive(open_archive(archive), self)
+
+
+class _WatchedArchive:
+    def __init__(self, archive: PictureArchive, looks: Looks) -> None:
+        self._archive, self._looks = archive, looks
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._archive, name)
+
+    def images(self, study: str, series: str) -> Retrieval:
+        found = self._archive.images(study, series)
+        self._looks.count += 1
+        return found
 
 
 def by_dicomweb(orthanc: Orthanc) -> Archive:

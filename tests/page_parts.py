@@ -81,6 +81,19 @@ def visiting(
     assert not visit.strangers, visit.strangers
 
 
+def take_example(visit: Visit) -> None:
+    """Open the page with the example's mask; it is read, and not reconstructed."""
+    visit.go()
+    visit.page.get_by_role("button", name="Take the example").click()
+    expect(visit.page.get_by_text("3 annotated planes found")).to_be_visible()
+
+
+def reconstruct(visit: Visit) -> None:
+    """Send what was chosen, and wait for the result."""
+    visit.page.get_by_role("button", name="Reconstruct", exact=True).click()
+    expect(visit.shown(".figures")).to_be_visible()
+
+
 def picture(locator: Locator) -> bytes:
     """What an element looks like."""
     return locator.screenshot()

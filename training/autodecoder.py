@@ -18,6 +18,8 @@ from training.objective import gaussian_entropy, reconstruction_loss
 from training.recorded import RecordedStep
 from training.samples import Batch, PointPool, ShapePoints
 
+#: File of a training's state in its folder.
+CHECKPOINT = "checkpoint.pt"
 #: Standard deviation of the codes' noise with the denoising objective.
 NOISE = 0.1
 #: Called after each step with the step's number and its figures, which are read every `READ_EVERY` steps only.
@@ -228,6 +230,6 @@ def train(trainer: Trainer, folder: Path, watch: Watch = lambda step, figures: N
             figures = trainer.advance(read=following % READ_EVERY == 0 or following == trainer.config.steps)
             watch(trainer.step, figures)
             if interruption.came or trainer.at_end() or trainer.step % trainer.config.checkpoint_every == 0:
-                trainer.save(folder / "checkpoint.pt")
+                trainer.save(folder / CHECKPOINT)
             interruption.stop_at(trainer.step, trainer.config.steps)
     return trainer.module

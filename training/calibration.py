@@ -32,6 +32,7 @@ from model.inference.posterior import (
 )
 from model.inference.reconstruction import COVER_SHARE_OF_BAND, OBSERVATION_BUDGET
 from model.inference.thick_slices import through_thickness
+from model.inference.typicality import peak_density
 from training.cohorts.cohort import Case, Cohort
 from training.config import Regime
 from training.evaluate import surface_distance
@@ -54,9 +55,10 @@ SCORED_VOXELS = 4000
 TIE = 0.005
 #: Evenly spaced validation cases that are used, those with which completed drawings are weighed, and those whose sound
 #: drawings are answered in the end.
-CASES, COMPLETED_CASES, JUDGED_CASES = 8, 24, 12
+CASES, COMPLETED_CASES, JUDGED_CASES = 8, 24, 36
 
-Watch = Callable[[float], None]
+#: Told that one of the stages is done.
+Advance = Callable[[], None]
 
 
 class Candidate(NamedTuple):
@@ -98,7 +100,7 @@ class Calibration:
         return {f"{c.spread_mm:g}": score.cross_entropy for c, score in self.scores.items() if c[:2] == best}
 
 
-def calibrate(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda precision: None) -> Calibration:
+def calibrate(model: ShapeModel, cases: Sequence[Case], advance: Advance = lambda: None) -> Calibration:
     """Choose for a model on cases that it was not trained on."""
     chosen = cases[:: -(-len(cases) // CASES)]
     totals: dict[Candidate, list[Score]] = {}
@@ -108,12 +110,12 @@ def calibrate(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda pr
             for regime in REGIMES:
                 for candidate, value in scores(trial, case, regime):
                     totals.setdefault(candidate, []).append(value)
-        watch(precision)
+        advance()
     return Calibration({candidate: Score(*np.mean(values, axis=0).tolist()) for candidate, values in totals.items()})
 
 
 def calibrate_bundle(
-    folder: Path, cohort: Cohort, watch: Watch = lambda precision: None, *, threads: int | None = None
+    folder: Path, cohort: Cohort, advance: Advance = lambda: None, *, threads: int | None = None
 ) -> Calibration:
     """Calibrate a bundle on a cohort's validation cases and record the result in its manifest.
 
@@ -125,7 +127,7 @@ def calibrate_bundle(
     """
     model = uncalibrated_share(open_bundle(folder, threads=threads))
     check_unseen(model.manifest, cohort.validation)
-    found = calibrate(model, cohort.validation, watch)
+    found = calibrate(model, cohort.validation, advance)
     facts: dict[str, object] = {
         "cohort": cohort.name,
         "split": "validation",
@@ -144,9 +146,9 @@ def calibrate_bundle(
         accuracy={},
     )
     if model.completer is not None:
-        changed = with_share(replace(model, manifest=changed), cohort.validation, watch)
+        changed = with_share(replace(model, manifest=changed), cohort.validation, advance)
         changed = with_spread(replace(model, manifest=changed), cohort.validation)
-    write_manifest(with_sound_drawings(replace(model, manifest=changed), cohort.validation, watch), folder)
+    write_manifest(with_sound_drawings(replace(model, manifest=changed), cohort.validation, advance), folder)
     return found
 
 
@@ -165,7 +167,7 @@ def uncalibrated_share(model: ShapeModel) -> ShapeModel:
     return model if model.completer is None else counting(model, UNCALIBRATED_SHARE)
 
 
-def with_share(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda precision: None) -> Manifest:
+def with_share(model: ShapeModel, cases: Sequence[Case], advance: Advance = lambda: None) -> Manifest:
     """The manifest with the least weight of completed drawings that brings surfaces nearest to the masks."""
     chosen = cases[:: -(-len(cases) // COMPLETED_CASES)]
     distances: dict[float, float] = {}
@@ -174,7 +176,7 @@ def with_share(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda p
         distances[share] = float(
             np.mean([surface_distance(trial, case, regime) for case in chosen for regime in REGIMES])
         )
-        watch(model.manifest.likelihood_precision)
+        advance()
     best = min(share for share in SHARES if distances[share] <= (1.0 + TIE) * min(distances.values()))
     facts = {**model.manifest.calibration, "asd_mm_by_share": {f"{share:g}": mm for share, mm in distances.items()}}
     return replace(counting(model, best).manifest, calibration=facts)
@@ -219,17 +221,17 @@ def calibrate_bundle_as(folder: Path, known: Manifest, cohort: Cohort, *, thread
     write_manifest(with_sound_drawings(replace(model, manifest=changed), cohort.validation), folder)
 
 
-def with_sound_drawings(model: ShapeModel, cases: Sequence[Case], watch: Watch = lambda precision: None) -> Manifest:
+def with_sound_drawings(model: ShapeModel, cases: Sequence[Case], advance: Advance = lambda: None) -> Manifest:
     """The manifest with what answers to sound drawings of validation cases show: usual, typical, width of SDs."""
     chosen = cases[:: -(-len(cases) // JUDGED_CASES)]
     sound = sound_answers(model, chosen)
-    watch(model.manifest.likelihood_precision)
+    advance()
     facts = {**model.manifest.calibration, "sound_drawings": len(sound), "sound_cases": len(chosen)}
     return replace(
         model.manifest,
         calibration=facts,
         usual=usual_figures(sound, len(chosen)),
-        typical=typical_figures(sound, len(chosen)),
+        typical=typical_figures(sound, len(chosen), peak_density(model)),
         posterior=posterior_scale(sound),
     )
 

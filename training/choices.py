@@ -1,6 +1,6 @@
 """What a caller of the training commands may choose, and the configuration that follows from it."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -62,62 +62,101 @@ class DeviceName(StrEnum):
     AUTO = "auto"
 
 
-def configured(
-    objective: ObjectiveName,
-    regime: RegimeName,
-    latent_size: int,
-    *,
-    flow: bool | None = None,
-    ard: bool | None = None,
-    reflected: bool,
-    seed: int,
-    device: DeviceName,
-    ard_weight: float | None = None,
-) -> "TrainingConfig":
-    """The configuration that the options describe; the default weight of ARD when None.
+@dataclass(frozen=True)
+class TrainingChoice:
+    """What a caller chooses of a training; what is None follows from the rest.
 
-    Flow and ARD are trained along with the decoder unless the objective is ``variational``, when None: codes that are
-    Gaussians get both when training is over (`training.pruning`). ``paper`` is the MorphoFlow paper as written: points
-    as codes, soft Dice, a plain decoder, the flow on the codes themselves, batches of 6.
+    Attributes:
+        flow, ard: whether they are trained along with the decoder; unless the objective is ``variational``, when None:
+            codes that are Gaussians get both when training is over (`training.pruning`).
+        ard_weight: of ARD; its default when None.
+        reflect: whether mirror images join; those of a cohort without sides, when None, but not in the paper's
+            objective.
+        steps, epochs: how long it is; the steps of the default configuration when both are None.
+        patience: see `with_patience`.
 
     Raises:
-        InvalidParameter: a weight of ARD was given where ARD does not act, or the device is not there.
+        InvalidParameter: two choices exclude each other, or one would do nothing.
+    """
+
+    objective: ObjectiveName
+    regime: RegimeName
+    latent_size: int
+    flow: bool | None = None
+    ard: bool | None = None
+    ard_weight: float | None = None
+    reflect: bool | None = None
+    steps: int | None = None
+    epochs: int | None = None
+    patience: int = 0
+    seed: int = 0
+    device: DeviceName = DeviceName.AUTO
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.epochs is not None:
+            raise InvalidParameter("Steps and epochs exclude each other; one of them is accepted.", part="epochs")
+        if self.ard_weight is not None and not self.use_ard:
+            raise InvalidParameter(
+                "ARD does not act along, so that --ard-weight would do nothing; it is accepted with --ard.",
+                part="ard_weight",
+            )
+
+    @property
+    def use_flow(self) -> bool:
+        """Whether a flow is trained along."""
+        return self._is_joint if self.flow is None else self.flow
+
+    @property
+    def use_ard(self) -> bool:
+        """Whether ARD acts along."""
+        return self._is_joint if self.ard is None else self.ard
+
+    @property
+    def _is_joint(self) -> bool:
+        return self.objective is not ObjectiveName.VARIATIONAL
+
+
+def configured(choice: TrainingChoice, *, reflected: bool) -> "TrainingConfig":
+    """The configuration that a choice describes, whatever the cohort's size.
+
+    ``paper`` is the MorphoFlow paper as written: points as codes, soft Dice, a plain decoder, the flow on the codes
+    themselves, batches of 6.
+
+    Args:
+        reflected: whether mirror images join.
+
+    Raises:
+        InvalidParameter: the device is not there.
     """
     from model.networks.decoder import DecoderShape
     from model.networks.flow import FlowShape
     from model.networks.prior import PriorShape
     from training.config import ObjectiveConfig, TrainingConfig
 
-    paper, together = objective is ObjectiveName.PAPER, objective is not ObjectiveName.VARIATIONAL
-    plain = TrainingConfig()
+    paper, plain = choice.objective is ObjectiveName.PAPER, TrainingConfig()
     prior = replace(
-        PriorShape(FlowShape(latent_size=latent_size)),
-        use_flow=together if flow is None else flow,
-        use_ard=together if ard is None else ard,
+        PriorShape(FlowShape(latent_size=choice.latent_size)),
+        use_flow=choice.use_flow,
+        use_ard=choice.use_ard,
         standardise=not paper,
     )
     loss = (
         ObjectiveConfig(name="paper", reconstruction="dice", ramp=0.0)
         if paper
-        else replace(plain.objective, name=objective.value)
+        else replace(plain.objective, name=choice.objective.value)
     )
-    if ard_weight is not None and not prior.use_ard:
-        raise InvalidParameter(
-            "ARD does not act along, so that --ard-weight would do nothing; it is accepted with --ard.",
-            part="ard_weight",
-        )
-    if ard_weight is not None:
-        loss = replace(loss, lambda_ard=ard_weight)
+    if choice.ard_weight is not None:
+        loss = replace(loss, lambda_ard=choice.ard_weight)
     return replace(
         plain,
-        decoder=DecoderShape(latent_size=latent_size, unit_columns=not paper),
+        decoder=DecoderShape(latent_size=choice.latent_size, unit_columns=not paper),
         prior=prior,
         objective=loss,
-        regime=regime.value,
+        regime=choice.regime.value,
         batch_shapes=6 if paper else plain.batch_shapes,
         reflected=reflected,
-        seed=seed,
-        device=resolved(device),
+        seed=choice.seed,
+        device=resolved(choice.device),
     )
 
 
@@ -148,13 +187,7 @@ def with_batches(config: "TrainingConfig", shapes: int) -> "TrainingConfig":
 
 
 def with_duration(config: "TrainingConfig", steps: int | None, epochs: int | None, shapes: int) -> "TrainingConfig":
-    """The configuration with its number of steps.
-
-    Raises:
-        InvalidParameter: steps and epochs were both given.
-    """
-    if steps is not None and epochs is not None:
-        raise InvalidParameter("Steps and epochs exclude each other; one of them is accepted.", part="epochs")
+    """The configuration with its number of steps: that of so many epochs, where they are given."""
     if epochs is not None:
         steps = epochs * -(-shapes // min(config.batch_shapes, shapes))
     return config if steps is None else replace(config, steps=steps)

@@ -18,6 +18,7 @@ from training.choices import (
     DeviceName,
     ObjectiveName,
     RegimeName,
+    TrainingChoice,
     anatomy_code,
     resolved,
 )
@@ -30,8 +31,10 @@ from training.reporting.command import report
 from training.sweep.command import sweep
 
 if TYPE_CHECKING:
+    from model.bundle import Manifest
     from training.config import TrainingConfig
     from training.pruning import PriorParts
+    from training.release import Naming
 
 
 def register(app: typer.Typer) -> None:
@@ -83,34 +86,34 @@ def train(
     """Train a shape model on a cohort of masks or of meshes."""
     with exit_status(goes_on="--resume goes on"):
         from training.configuring import check_patience, configured_for
-        from training.runs import check_free
+        from training.runs import check_begun, check_free
 
-        if output is not None:
-            check_output(output, is_folder=True)
-        if output is not None and not resume:
-            check_free(output)
-        found = opened_cohort(source, options)
-        tell_findings(found)
-        check_patience(found, patience)
-        warn(expectations.of_training(found))
-        config = configured_for(
-            found,
+        choice = TrainingChoice(
             objective,
             regime,
             latent_size,
-            reflect=reflect,
             flow=flow,
             ard=ard,
             ard_weight=ard_weight,
+            reflect=reflect,
             steps=steps,
             epochs=epochs,
             patience=patience,
             seed=options.seed,
             device=device,
         )
+        if output is not None:
+            check_output(output, is_folder=True)
+        check_folder = check_begun if resume else check_free
+        if output is not None:
+            check_folder(output)
+        found = opened_cohort(source, options)
+        tell_findings(found)
+        check_patience(found, patience)
+        warn(expectations.of_training(found))
+        config = configured_for(found, choice)
         folder = output or Path("runs") / f"{found.name}-{regime}"
-        if not resume:
-            check_free(folder)
+        check_folder(folder)
         figures = _train_with_progress(found, config, folder, resume=resume)
         _print_run(found, config, folder, figures, as_json=as_json)
 
@@ -158,44 +161,16 @@ def export(
 ) -> None:
     """Export a run as a bundle that the service loads."""
     with exit_status():
-        from model.bundle import check_names
-        from training.pruning import PriorParts
-        from training.release import STAGES, export_run, wants_prior
+        from training.export_choice import ExportChoice
+        from training.release import Naming, wants_prior
 
-        check_names(name, version)
+        naming = Naming(name, version, anatomy_code(anatomy), resolution_mm)
         check_output(output, is_folder=True)
-        stood_still = wants_prior(run)
-        fitted = stood_still if prune is None else prune
-        if not fitted and (least_movement is not None or training_share is not None):
-            raise InvalidParameter(
-                "Nothing is pruned, so that --least-movement and --training-share would do nothing; they are accepted "
-                "with --prune.",
-                part="prune",
-            )
-        parts = PriorParts(
-            least_movement=LEAST_MOVEMENT if least_movement is None else least_movement,
-            least_of_training=LEAST_OF_TRAINING if training_share is None else training_share,
-        )
-        if source.is_given:
-            if not (fitted and stood_still):
-                raise InvalidParameter(
-                    "A cohort chooses how much of the training's prior stays; it is accepted where a prior is fitted "
-                    "to the codes of a run without a flow or ARD of its own.",
-                    part="cohort",
-                )
+        choice = ExportChoice(prune, least_movement, training_share, by_cohort=source.is_given)
+        parts = choice.parts(stood_still=wants_prior(run))
+        if parts is not None and source.is_given:
             parts = _parts_for(run, parts, source, options)
-        code = anatomy_code(anatomy)
-        with progress(len(STAGES), "exporting") as bar:
-            manifest = export_run(
-                run,
-                output,
-                name=name,
-                version=version,
-                parts=parts if fitted else None,
-                anatomy=code,
-                resolution_mm=resolution_mm,
-                watch=lambda words: bar.update(bar.task_ids[0], description=words, completed=STAGES.index(words)),
-            )
+        manifest = _exported_with_progress(run, output, parts, naming)
         summary = {
             "bundle": str(output),
             "name": manifest.name,
@@ -205,6 +180,17 @@ def export(
         typer.echo(json.dumps(summary) if as_json else f"{manifest.name} {manifest.version} written to {output}")
 
 
+def _exported_with_progress(run: Path, output: Path, parts: "PriorParts | None", naming: "Naming") -> "Manifest":
+    from training.release import STAGES, export_run
+
+    with progress(len(STAGES), "exporting") as bar:
+
+        def watch(words: str) -> None:
+            bar.update(bar.task_ids[0], description=words, completed=STAGES.index(words))
+
+        return export_run(run, output, parts, naming, watch)
+
+
 def _parts_for(run: Path, parts: "PriorParts", source: CohortSource, options: CohortOptions) -> "PriorParts":
     from training.prior_choice import MODELS, chosen_parts
 
@@ -212,7 +198,7 @@ def _parts_for(run: Path, parts: "PriorParts", source: CohortSource, options: Co
     if not found.validation:
         raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
     with progress(MODELS, f"choosing the prior on {found.name}") as bar:
-        choice = chosen_parts(run, parts, found.validation, watch=lambda: bar.advance(bar.task_ids[0]))
+        choice = chosen_parts(run, parts, found.validation, advance=lambda: bar.advance(bar.task_ids[0]))
     typer.echo(
         f"{100.0 * choice.parts.least_of_training:g} % of the training's prior stays at least: "
         f"validation shapes come out {choice.error:.3f} mm off, {choice.trained_error:.3f} mm as trained",
@@ -291,7 +277,7 @@ def calibrate(
             raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
         warn(expectations.of_calibration(found))
         with progress(stages(before), f"calibrating on {found.name}") as bar:
-            chosen = calibrate_bundle(bundle, found, lambda precision: bar.advance(bar.task_ids[0]))
+            chosen = calibrate_bundle(bundle, found, lambda: bar.advance(bar.task_ids[0]))
         best, manifest = chosen.best, read_manifest(bundle)[0]
         spread_mm, share = manifest.discrepancy["spread_mm"], manifest.completion.get("share")
         summary = {

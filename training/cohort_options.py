@@ -9,13 +9,11 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from training.cohorts import Cohort, CohortName, CohortOptions
+from training.cohorts.catalogue import DATA_VARIABLE
 from training.cohorts.cohort import SideName
 from training.cohorts.sources import CohortSource, LayoutName, check_given, open_cohort
 from training.cohorts.voxelising import SpaceName
 from training.console import exit_status, progress
-
-#: Names the data folder where no option does.
-DATA_VARIABLE = "MORPHOFLOW_DATA"
 
 CohortOption = Annotated[CohortName | None, typer.Option("--cohort", help="A public cohort below the data folder.")]
 MasksOption = Annotated[Path | None, typer.Option("--masks", help="A folder of NIfTI, NRRD or MetaImage masks.")]

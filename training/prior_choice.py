@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
-from training.calibration import PRECISIONS, with_precision
+from training.calibration import PRECISIONS, Advance, with_precision
 from training.cohorts.cohort import Case, listed
 from training.config import Regime
 from training.evaluate import surface_distance
@@ -34,8 +34,6 @@ CASES = 24
 MARGIN = 0.002
 #: Models that are measured at most: the trained one with every precision, and two fitted ones.
 MODELS = len(PRECISIONS) + 2
-
-Watch = Callable[[], None]
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ def chosen_parts(
     cases: Sequence[Case],
     regimes: Sequence[Regime] = REGIMES,
     precisions: Sequence[float] = PRECISIONS,
-    watch: Watch = lambda: None,
+    advance: Advance = lambda: None,
 ) -> Choice:
     """The most fitted prior with which shapes that were not trained on are reconstructed as well as with the trained.
 
@@ -70,7 +68,7 @@ def chosen_parts(
         cases: at least one.
         regimes: of their drawings.
         precisions: likelihood precisions (1/mm^2) that the model may come to be used at.
-        watch: called after each model that was measured.
+        advance: called after each model that was measured.
 
     Raises:
         InvalidParameter: the run is not finished, or was trained on one of the cases.
@@ -80,7 +78,7 @@ def chosen_parts(
 
     def errors(model: ShapeModel, precision: float) -> Float[np.ndarray, "n"]:
         found = _errors(model, precision, used, regimes)
-        watch()
+        advance()
         return found
 
     as_trained = trial_model(run, None)

@@ -1,11 +1,9 @@
 """Relevance of a trained model's dimensions, the ones that matter alone, and the prior fitted to their codes.
 
-A dimension is dead when training left it next to no sigma, so that it moves no surface, or when its codes say nothing:
-the divergence of the posterior from the prior along it, averaged over the training shapes, is next to zero. What it
-adds at its mean goes into biases, so the field of the pruned decoder is that of the whole one with dead dimensions at
-their mean. The flow is autoregressive: dead dimensions enter the conditioners of live ones as their mean too, transform
-after transform. Between transforms a dead dimension may follow live ones a little; `Pruned.base_change` measures what
-that alters.
+Of codes that are points, a dimension is dead along which they hardly differ. What it adds at its mean goes into biases,
+so the field of the pruned decoder is that of the whole one with dead dimensions at their mean. The flow is
+autoregressive: dead dimensions enter the conditioners of live ones as their mean too, transform after transform.
+Between transforms a dead dimension may follow live ones a little; `Pruned.base_change` measures what that alters.
 
 `refitted` goes on with codes that are Gaussians, and with all of their dimensions: one that says little of the training
 shapes may still be what another shape needs. It turns them to the principal movements of the surface
@@ -34,9 +32,7 @@ from training.principal import principal_axes, turned_decoder
 from training.prior_fit import Background, Codes, fitted_prior
 from training.shrinkage import shrunk_covariance
 
-#: A dimension whose divergence is below this (nats a training shape) is dead.
-LEAST_NATS = 0.02
-#: So is one whose sigma, or standard deviation of the codes where these are points, is below this share of the largest.
+#: A dimension is dead along which the standard deviation of codes that are points is below this share of the largest.
 LEAST_SHARE = 0.02
 
 
@@ -66,7 +62,8 @@ class Pruned:
     Attributes:
         live: numbers of these dimensions in the whole code.
         codes: (m, k) training codes; in principal coordinates there may be fewer of them than live dimensions.
-        nats: (d,) divergence of each dimension of the whole code; NaN where codes are points.
+        nats: (d,) mean divergence of the codes from the prior along each dimension of the whole code; NaN where codes
+            are points.
         base_change: largest change of a live base coordinate of a training code, in sigmas, with the flow as it was.
         trained_sigmas: (d,) of the whole prior.
         flow_gain: what the flow that was fitted anew adds to the log density of held-out codes (nats); None before.
@@ -101,23 +98,20 @@ class Pruned:
 
     def rule(self) -> str:
         """By what dimensions were kept, in words."""
-        if self.fitted is not None:
-            moving = f"movement at least {self.fitted.least_movement:g} of the largest"
-            return moving if self.fitted.ard and self.fitted.least_movement > 0.0 else "all"
-        if np.isnan(self.nats).any():
+        if self.fitted is None:
             return f"standard deviation of the codes at least {LEAST_SHARE:g} of the largest"
-        return f"sigma at least {LEAST_SHARE:g} of the largest and divergence at least {LEAST_NATS:g} nats a shape"
+        moving = f"movement at least {self.fitted.least_movement:g} of the largest"
+        return moving if self.fitted.ard and self.fitted.least_movement > 0.0 else "all"
 
 
 @torch.no_grad()
-def pruned(module: AutoDecoder, *, keep_all: bool = False) -> Pruned:
-    """Decoder and prior without dead dimensions.
+def pruned(module: AutoDecoder) -> Pruned:
+    """Decoder and prior without dead dimensions; with all of them where codes are Gaussians.
 
     Raises:
         InvalidParameter: all dimensions are dead.
     """
-    nats = divergences(module)
-    live = np.full(len(nats), keep_all) | live_dimensions(module, nats)
+    nats, live = divergences(module), live_dimensions(module)
     if not live.any():
         raise InvalidParameter("All dimensions are dead; a run with at least one live one is accepted.", part="prune")
     kept, codes = torch.from_numpy(np.flatnonzero(live)), module.code_means()
@@ -141,7 +135,7 @@ def refitted(
         parts: what is fitted; all when None.
     """
     parts = PriorParts() if parts is None else parts
-    less = pruned(module, keep_all=module.random)
+    less = pruned(module)
     if not module.random:
         return less
     codes, target = gaussian_codes(module, shapes)
@@ -194,11 +188,13 @@ def divergences(module: AutoDecoder) -> Float[np.ndarray, "d"]:
 
 
 @torch.no_grad()
-def live_dimensions(module: AutoDecoder, nats: Float[np.ndarray, "d"]) -> Bool[np.ndarray, "d"]:
-    """Dimensions that say something about the training shapes and move their surfaces."""
-    scale = (module.prior.sigma if module.random else module.code_means().std(dim=0)).numpy()
-    wide = scale >= LEAST_SHARE * scale.max()
-    return np.asarray(wide & (nats >= LEAST_NATS) if module.random else wide)
+def live_dimensions(module: AutoDecoder) -> Bool[np.ndarray, "d"]:
+    """Dimensions along which codes that are points differ; all of Gaussian codes."""
+    codes = module.code_means()
+    if module.random:
+        return np.ones(codes.shape[1], bool)
+    scale = codes.std(dim=0).numpy()
+    return np.asarray(scale >= LEAST_SHARE * scale.max())
 
 
 @torch.no_grad()

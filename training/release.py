@@ -1,79 +1,124 @@
 """A finished run as a bundle: graphs, statistics of the training codes, and a manifest."""
 
+import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from model.bundle import POPULATION, Manifest, Population, ShapeModel, file_digest, plain_name, write_manifest
+from model.bundle import (
+    MANIFEST,
+    POPULATION,
+    Manifest,
+    Population,
+    ShapeModel,
+    check_names,
+    file_digest,
+    plain_name,
+    write_manifest,
+)
 from model.errors import InvalidParameter
+from model.inference.modes import active_counts
 from model.networks.decoder import OccupancyDecoder
 from model.networks.export import export_graphs, quiet_exporter, torch_networks
 from model.networks.prior import LatentPrior
-from training.autodecoder import AutoDecoder, is_ended
+from training.autodecoder import CHECKPOINT, AutoDecoder, is_ended
 from training.config import TrainingConfig
 from training.pruning import PriorParts, Pruned, refitted
-from training.runs import CHECKPOINT, read_record
+from training.runs import read_record
 
-#: Shares of the base variance for which active dimensions are counted (MorphoFlow paper).
-VARIANCE_SHARES = (0.95, 0.97, 0.99)
 #: Information of one mm^2 of annotated plane where none was calibrated (1/mm^2).
 UNCALIBRATED_PRECISION = 0.1
 #: Grid step of the surface (mm) unless the caller asks otherwise.
 RESOLUTION_MM = 1.0
+#: Name, with a suffix, of the folder in the output in which an export is made.
+UNFINISHED = ".unfinished-"
 #: Of an export, in words.
 STAGES = ("fitting the prior", "writing the graphs", "writing the population")
 
 Watch = Callable[[str], None]
 
 
+@dataclass(frozen=True)
+class Naming:
+    """What a caller says of a model beside what its run knows.
+
+    Attributes:
+        name: the cohort's when None.
+        anatomy: the code that results in DICOM carry (`model.bundle.Manifest.anatomy`).
+        resolution_mm: grid step of the surface unless a request names another.
+
+    Raises:
+        InvalidParameter: see `model.bundle.check_names`.
+    """
+
+    name: str | None = None
+    version: str = "1"
+    anatomy: Mapping[str, str] = field(default_factory=dict)
+    resolution_mm: float = RESOLUTION_MM
+
+    def __post_init__(self) -> None:
+        check_names(self.name, self.version)
+
+    def on(self, manifest: Manifest) -> Manifest:
+        """The manifest with what is said here."""
+        name = plain_name(manifest.name) if self.name is None else self.name
+        return replace(
+            manifest,
+            name=name,
+            version=self.version,
+            anatomy=dict(self.anatomy),
+            resolution_mm=self.resolution_mm,
+        )
+
+
 def export_run(
     run: Path,
     output: Path,
-    *,
-    name: str | None = None,
-    version: str = "1",
-    likelihood_precision: float = UNCALIBRATED_PRECISION,
-    accuracy: Mapping[str, Mapping[str, float]] | None = None,
     parts: PriorParts | None = None,
-    anatomy: Mapping[str, str] | None = None,
-    resolution_mm: float = RESOLUTION_MM,
+    naming: Naming | None = None,
     watch: Watch = lambda words: None,
 ) -> Manifest:
     """Write the bundle of a finished run: as it was trained, or with these parts of a prior fitted to its codes.
 
-    `anatomy` is the code that results in DICOM carry (`model.bundle.Manifest.anatomy`). `watch` is told each of the
-    `STAGES` as it begins.
+    What an export that was stopped has left in the folder is removed.
+
+    Args:
+        naming: that of the cohort when None.
+        watch: told each of the `STAGES` as it begins.
 
     Raises:
         InvalidParameter: the folder holds no finished run, or the output holds something already.
         ParityError: the exported graphs disagree with the networks.
     """
-    if output.exists() and any(output.iterdir()):
+    if output.exists() and not all(path.name.startswith(UNFINISHED) for path in output.iterdir()):
         raise InvalidParameter("The output folder is not empty; a new or an empty folder is accepted.", part="output")
     watch(STAGES[0])
     found = assembled(run, parts)
-    watch(STAGES[1])
     output.mkdir(parents=True, exist_ok=True)
+    for left in output.iterdir():
+        shutil.rmtree(left)
+    with TemporaryDirectory(dir=output, prefix=UNFINISHED) as folder:
+        manifest = _written(found, Path(folder), naming or Naming(), watch)
+        for name in (*manifest.files, MANIFEST):
+            (Path(folder) / name).rename(output / name)
+    return manifest
+
+
+def _written(found: "Assembled", folder: Path, naming: Naming, watch: Watch) -> Manifest:
+    watch(STAGES[1])
     with quiet_exporter():
-        files = export_graphs(found.decoder, found.prior, output)
+        files = export_graphs(found.decoder, found.prior, folder)
     watch(STAGES[2])
-    np.savez(output / POPULATION, **asdict(found.population()))
-    manifest = replace(
-        found.manifest(),
-        name=plain_name(found.record["cohort"]) if name is None else name,
-        version=version,
-        resolution_mm=resolution_mm,
-        likelihood_precision=likelihood_precision,
-        accuracy={regime: dict(figures) for regime, figures in (accuracy or {}).items()},
-        anatomy=dict(anatomy or {}),
-        files={file: file_digest(output / file) for file in sorted([*files, POPULATION])},
-    )
-    write_manifest(manifest, output)
+    np.savez(folder / POPULATION, **asdict(found.population()))
+    digests = {file: file_digest(folder / file) for file in sorted([*files, POPULATION])}
+    manifest = replace(naming.on(found.manifest()), files=digests)
+    write_manifest(manifest, folder)
     return manifest
 
 
@@ -188,9 +233,7 @@ def _array(values: torch.Tensor) -> Float[np.ndarray, "..."]:
 
 def active_dimensions(sigmas: Float[np.ndarray, "d"]) -> tuple[int, int, int]:
     """How many dimensions, largest first, hold 95, 97 and 99 % of the base variance."""
-    shares = np.cumsum(np.sort(sigmas**2)[::-1]) / np.sum(sigmas**2)
-    counts = [int(np.searchsorted(shares, share - 1e-12)) + 1 for share in VARIANCE_SHARES]
-    return counts[0], counts[1], counts[2]
+    return active_counts(np.cumsum(np.sort(sigmas**2)[::-1]) / np.sum(sigmas**2))
 
 
 def training_facts(config: TrainingConfig, record: Mapping[str, Any]) -> dict[str, object]:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from model.errors import InvalidParameter
-from training.autodecoder import AutoDecoder, Trainer, is_ended, train
+from training.autodecoder import CHECKPOINT, AutoDecoder, Trainer, Watch, is_ended, train
 from training.cohorts.cohort import Case, Cohort
 from training.config import TrainingConfig, config_from_dict
 from training.difference import first_difference
@@ -21,14 +20,11 @@ from training.seen import short_digest
 from training.stopping import EarlyStopping
 from training.validation import Validation
 
-CHECKPOINT = "checkpoint.pt"
 RECORD = "run.json"
 #: Folder of TensorBoard events.
 FIGURES = "figures"
 #: Evenly spaced held-out shapes that are measured during training, at most.
 VALIDATED = 32
-
-Watch = Callable[[int, dict[str, float]], None]
 
 
 @dataclass(frozen=True)
@@ -159,6 +155,18 @@ def check_free(folder: Path) -> None:
     if (folder / RECORD).is_file():
         raise InvalidParameter(
             "The output folder holds a run already; an empty folder, or --resume, is accepted.", part="output"
+        )
+
+
+def check_begun(folder: Path) -> None:
+    """Refuse to continue what never began.
+
+    Raises:
+        InvalidParameter: the folder holds no run.
+    """
+    if not (folder / RECORD).is_file():
+        raise InvalidParameter(
+            "The output folder holds no run to resume; without --resume a new one begins there.", part="output"
         )
 
 

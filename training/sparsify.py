@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal, assert_never
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy.optimize import linear_sum_assignment
 
 from model.geometry import Grid
@@ -152,12 +152,6 @@ def random_slices(mask: Bool[np.ndarray, "i j k"], rng: np.random.Generator) -> 
     """A random slice that holds foreground across each index axis."""
     first, second, third = (np.flatnonzero(mask.any(axis=other)) for other in ((1, 2), (0, 2), (0, 1)))
     return int(rng.choice(first)), int(rng.choice(second)), int(rng.choice(third))
-
-
-def labelled_points(drawing: Drawing) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
-    """All voxels that were looked at: world points (RAS mm) and occupancy labels."""
-    index = np.argwhere(drawing.annotated)
-    return drawing.stack.grid.to_world(index.astype(float)), drawing.stack.foreground[tuple(index.T)]
 
 
 def _draw(mask: Bool[np.ndarray, "i j k"], grid: Grid, chosen: list[tuple[int, int]]) -> Drawing:

@@ -19,8 +19,9 @@ from model.inference.discrepancy.conditioning import discrepancy_prior
 from model.inference.mesh import vertex_areas, volume_ml
 from model.inference.observations import observe
 from model.inference.posterior import fitted_logits
-from model.inference.reconstruction import COVER_SHARE_OF_BAND, OBSERVATION_BUDGET, Options, reconstruct
+from model.inference.reconstruction import COVER_SHARE_OF_BAND, OBSERVATION_BUDGET, SURFACE_SD, Options, reconstruct
 from model.inference.reliability import MOST_USUAL_PLANES, USUAL_PLANES, Figures, figures_of
+from model.inference.typicality import rarity
 from model.inference.uncertainty import surface_spread
 from training.cohorts.cohort import Case
 from training.perturb import Sections, parallel, sections_of
@@ -31,8 +32,8 @@ from training.surface_error import digitisation_mm, distances_to, true_points
 USUAL_QUANTILE = 0.95
 #: Numbers of parallel planes.
 PARALLEL = (3, 5, MOST_USUAL_PLANES)
-#: SDs (of logarithms, and of nats) are not taken for smaller than these, whatever a few shapes show.
-LEAST_SD = {"misfit": 0.15, "density": 1.0, "slice": 0.2}
+#: SDs (of logarithms, and of cube roots of nats) are not taken for smaller than these, whatever a few shapes show.
+LEAST_SD = {"misfit": 0.15, "rarity": 0.15, "slice": 0.2}
 
 
 @dataclass(frozen=True)
@@ -84,17 +85,21 @@ def freedom_of(cases: int) -> int:
     return max(2 * cases - 1, 3)
 
 
-def typical_figures(sound: Sequence[Sound], cases: int) -> dict[str, float]:
-    """`Manifest.typical` of a model, from drawings of so many cases."""
+def typical_figures(sound: Sequence[Sound], cases: int, peak: float) -> dict[str, float]:
+    """`Manifest.typical` of a model, from drawings of so many cases.
+
+    Args:
+        peak: log prior density of the mean shape (nats).
+    """
     planes = np.array([one.figures.planes for one in sound], float)
     across, misfits = np.log(planes / USUAL_PLANES), _logs(np.array([one.figures.misfit_mm for one in sound]))
     exponent = _exponent(across, misfits)
     samples = {
         "misfit": misfits - exponent * across,
-        "density": np.array([one.density for one in sound]),
+        "rarity": rarity(np.array([one.density for one in sound]), peak),
         "slice": np.concatenate([one.surprises for one in sound]),
     }
-    found = {"freedom": float(freedom_of(cases)), "misfit_exponent": round(exponent, 4)}
+    found = {"freedom": float(freedom_of(cases)), "misfit_exponent": round(exponent, 4), "density_peak": round(peak, 4)}
     for name, values in samples.items():
         found[f"{name}_mean"] = round(float(values.mean()), 4)
         found[f"{name}_sd"] = round(max(LEAST_SD[name], float(values.std(ddof=1))), 4)
@@ -116,7 +121,7 @@ def answered(model: ShapeModel, case: Case, drawing: Sections) -> Sound:
     observations = observe(drawing.stacks, drawing.planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=0)
     figures = figures_of(model, found, drawing.stacks, observations, mesh, discrepancy_prior(model.manifest))
     sections = compared(observations, fitted_logits(model, found, observations.points), found.plane_weights)
-    spread, sd = surface_spread(model, answer.state, mesh), mesh.scalars["surface_sd_mm"]
+    spread, sd = surface_spread(model, answer.state, mesh), mesh.scalars[SURFACE_SD]
     swelling = vertex_areas(mesh) / 1000.0
     errors = np.square(distances_to(true_points(case.mask, case.grid), mesh.vertices)).mean()
     truth = float(case.mask.sum() * np.prod(case.grid.spacing)) / 1000.0

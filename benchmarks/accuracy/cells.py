@@ -1,13 +1,14 @@
 """One method on one drawing of one case, and the file that keeps what was measured."""
 
-import json
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from benchmarks.accuracy.drawings import DrawingName
 from benchmarks.accuracy.names import MethodName
+from benchmarks.json_lines import append_lines, read_lines
 
 
 @dataclass(frozen=True)
@@ -65,19 +66,12 @@ class CellFile:
 
     def read(self) -> dict[CellKey, Cell]:
         """All cells; the last one of equal keys."""
-        if not self.path.is_file():
-            return {}
-        lines = self.path.read_text(encoding="utf-8").splitlines()
-        cells = [cell for cell in map(_parsed, lines) if cell is not None]
-        return {cell.key: cell for cell in cells}
+        cells = map(_parsed, read_lines(self.path))
+        return {cell.key: cell for cell in cells if cell is not None}
 
     def append(self, cells: Iterable[Cell]) -> None:
         """Add cells and see them written."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        whole = not self.path.is_file() or self.path.read_bytes()[-1:] in (b"", b"\n")
-        with self.path.open("a", encoding="utf-8") as stream:
-            stream.write("" if whole else "\n")
-            stream.writelines(json.dumps(_plain(cell)) + "\n" for cell in cells)
+        append_lines(self.path, map(_plain, cells))
 
 
 def _plain(cell: Cell) -> dict[str, object]:
@@ -93,9 +87,8 @@ def _written(value: object) -> object:
     return value
 
 
-def _parsed(line: str) -> Cell | None:
+def _parsed(values: Any) -> Cell | None:
     try:
-        values = json.loads(line)
         key = {f.name: values.pop(f.name) for f in fields(CellKey)}
         key |= {"drawing": DrawingName(key["drawing"]), "method": MethodName(key["method"])}
         refusal = str(values.pop("refusal"))

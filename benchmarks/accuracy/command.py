@@ -20,9 +20,10 @@ from benchmarks.accuracy.plan import CohortPlan, chosen_cases, keys_of, tasks_of
 from benchmarks.accuracy.summary import summarise, write_csv
 from benchmarks.accuracy.table import as_markdown
 from benchmarks.accuracy.targets import targets_of
-from model.bundle import open_bundle, read_manifest
+from model.bundle import MANIFEST, open_bundle, read_manifest
 from model.errors import InvalidParameter
 from training.baselines.distance_choice import kept
+from training.cohort_options import DataOption
 from training.cohorts import CohortName, CohortOptions, data_folder, load_cohort
 from training.console import exit_status, progress
 
@@ -40,7 +41,7 @@ def main(
     methods: Annotated[list[MethodName] | None, typer.Option(help="May repeat; all but adam when left out.")] = None,
     cases: Annotated[int, typer.Option(min=1, help="Test cases of a cohort at most, evenly spaced.")] = 30,
     adam_cases: Annotated[int, typer.Option(min=0, help="First cases for the predecessor, with --methods adam.")] = 2,
-    data: Annotated[Path | None, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = None,
+    data: DataOption = None,
     output: Annotated[Path, typer.Option(help="Folder of cells, table and pictures.")] = OUTPUT,
     cache: Annotated[Path, typer.Option(help="Folder of what the baselines learned.")] = CACHE,
     docs: Annotated[
@@ -76,7 +77,7 @@ def bundles_of(named: Sequence[str]) -> dict[str, Path]:
     Raises:
         InvalidParameter: a name without a folder.
     """
-    found = {name.value: SHIPPED / name for name in CohortName if (SHIPPED / name / "manifest.json").is_file()}
+    found = {name.value: SHIPPED / name for name in CohortName if (SHIPPED / name / MANIFEST).is_file()}
     for words in named:
         name, sign, folder = words.partition("=")
         if not sign or name not in list(CohortName):

@@ -9,6 +9,7 @@ from benchmarks.generator.first_byte import first_byte_s
 from benchmarks.generator.measuring import Plan, measured
 from benchmarks.generator.table import Figure, markdown
 from training.choices import SplitName
+from training.cohort_options import DataOption
 from training.cohorts import CohortName, CohortOptions, data_folder, load_cohort
 from training.console import exit_status, progress
 from training.evaluate import find_bundle, open_named, shipped_bundles
@@ -26,7 +27,7 @@ def run(
     timed: Annotated[int, typer.Option(min=1, help="Draws at full resolution that are timed.")] = 24,
     spacing_mm: Annotated[float, typer.Option(min=0.5, max=5.0, help="Grid step of compared surfaces (mm).")] = 2.0,
     split: Annotated[SplitName, typer.Option(help="Held-out masks.")] = SplitName.VALIDATION,
-    data: Annotated[Path | None, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = None,
+    data: DataOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Of validation persons, the one used in training.")] = 0,
     service: Annotated[bool, typer.Option("--service/--no-service", help="Time the service as well.")] = True,
     output: Annotated[Path | None, typer.Option(help="Markdown file to write as well.")] = None,

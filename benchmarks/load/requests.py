@@ -23,9 +23,9 @@ from benchmarks.server import serving
 from model.inference.reconstruction import Options
 from service import use_cases
 from service.adapters.mesh_formats import write_mesh
-from service.app import mask_reader
 from service.model_registry import load_registry
 from service.settings import load_settings
+from service.wiring import mask_reader
 
 #: Users at 80 % load; many, so that none of them holds the others up.
 USERS = 16

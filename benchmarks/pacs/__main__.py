@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.pacs.scene import DATA, play
+from benchmarks.pacs.scene import play
 from benchmarks.pacs.storm import storm
+from training.cohort_options import DataOption
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -14,7 +15,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 @app.command("scene")
 def _scene(
     folder: Annotated[Path, typer.Option(help="Emptied, then used.")] = Path("build/pacs"),
-    data: Annotated[Path, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = DATA,
+    data: DataOption = None,
     dicomweb: Annotated[bool, typer.Option("--dicomweb", help="Reach and be reached by DICOMweb.")] = False,
 ) -> None:
     """Three planes drawn on a series become results in the archive."""

@@ -33,7 +33,6 @@ from service.adapters.image_guard import ImageLimits
 from service.adapters.images import write_nifti
 from training.metrics_masks import dice
 
-DATA = Path("../shared/data")
 LIMITS = ImageLimits(max_bytes=1 << 28, max_voxels=1 << 27)
 #: The results have to be in the archive after so long (s).
 LIMIT_S = 5.0
@@ -69,7 +68,7 @@ class Scene:
         return self.results == len(RESULTS) and not self.errors and same
 
 
-def play(folder: Path, data: Path = DATA, *, dicomweb: bool = False) -> Scene:
+def play(folder: Path, data: Path | None = None, *, dicomweb: bool = False) -> Scene:
     """Start archive and service, play the scene, print the study's content."""
     if not is_installed():
         raise SystemExit("Orthanc with DICOMweb and dcmtk are needed (Debian: orthanc orthanc-dicomweb dcmtk).")
@@ -109,12 +108,20 @@ def measure(folder: Path, forward: str = BY_DIMSE) -> list[Figure]:
     ]
 
 
-def _study(data: Path) -> tuple[list[Dataset], Bool[np.ndarray, "i j k"]]:
+def _study(data: Path | None) -> tuple[list[Dataset], Bool[np.ndarray, "i j k"]]:
     """A real series and a test hippocampus where the cohorts lie at hand, else the example on a series of its own."""
+    return _example() if data is None else _real_study(data) or _example()
+
+
+def _real_study(data: Path) -> tuple[list[Dataset], Bool[np.ndarray, "i j k"]] | None:
     series, masks = data / "dicom" / "study1", sorted((data / "hippocampus" / "test").glob("*.nii.gz"))
-    if series.is_dir() and masks:
-        images = real_series(series)
-        return images, placed(masks[0], series_of(images).grid)
+    if not (series.is_dir() and masks):
+        return None
+    images = real_series(series)
+    return images, placed(masks[0], series_of(images).grid)
+
+
+def _example() -> tuple[list[Dataset], Bool[np.ndarray, "i j k"]]:
     loaded = nib.Nifti1Image.from_filename(EXAMPLE)
     columns, rows, planes = loaded.shape
     grid = Grid((columns, rows, planes), np.asarray(loaded.affine, float))

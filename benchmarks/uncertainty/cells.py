@@ -1,9 +1,10 @@
 """What was measured, one line of JSON a cell, so that a run that was ended goes on where it stopped."""
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+from benchmarks.json_lines import append_lines, read_lines
 
 #: Figures of one cell, plain numbers and lists.
 Payload = dict[str, Any]
@@ -35,12 +36,9 @@ class Store:
 
     def read(self) -> dict[Key, Payload]:
         """All cells; the last one of equal keys."""
-        if not self.path.is_file():
-            return {}
         found = {}
-        for line in self.path.read_text(encoding="utf-8").splitlines():
+        for values in read_lines(self.path):
             try:
-                values = json.loads(line)
                 found[Key(**values["key"])] = dict(values["payload"])
             except (ValueError, KeyError, TypeError):
                 continue
@@ -48,8 +46,4 @@ class Store:
 
     def append(self, key: Key, payload: Payload) -> None:
         """Add a cell and see it written."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        whole = not self.path.is_file() or self.path.read_bytes()[-1:] in (b"", b"\n")
-        with self.path.open("a", encoding="utf-8") as stream:
-            stream.write("" if whole else "\n")
-            stream.write(json.dumps({"key": asdict(key), "payload": payload}) + "\n")
+        append_lines(self.path, [{"key": asdict(key), "payload": payload}])

@@ -26,6 +26,7 @@ from benchmarks.uncertainty.strangers import Trial, measure_trial, trials
 from benchmarks.uncertainty.summary import Line, lines_of
 from model.bundle import ShapeModel, open_bundle, read_manifest
 from training.choices import RegimeName
+from training.cohort_options import DataOption
 from training.cohorts import Case, CohortName, CohortOptions, data_folder, load_cohort
 from training.console import exit_status, progress
 from training.sparsify import REGIMES
@@ -55,7 +56,7 @@ def main(
     plane_cases: Annotated[int, typer.Option(min=0, help="Cases on which planes are advised.")] = 10,
     gold_cases: Annotated[int, typer.Option(min=0, help="Cases that are sampled, minutes each.")] = 0,
     strangers: Annotated[CohortName | None, typer.Option(help="Whose model is sent strange shapes.")] = None,
-    data: Annotated[Path | None, typer.Option(envvar="MORPHOFLOW_DATA", help="Folder of the cohorts.")] = None,
+    data: DataOption = None,
     output: Annotated[Path, typer.Option(help="Folder of cells, table and diagrams.")] = OUTPUT,
     jobs: Annotated[int, typer.Option(min=1, help="Processes at a time.")] = 1,
     mapped: Annotated[int, typer.Option(min=0, help="Cases whose SDs are drawn beside the errors.")] = 0,

@@ -16,7 +16,7 @@ from benchmarks.accuracy.drawings import DrawingName, draw
 from benchmarks.accuracy.pictures import CONTOUR_COLOUR, contours
 from model.bundle import ShapeModel
 from model.inference.mesh import Mesh
-from model.inference.reconstruction import Options, reconstruct
+from model.inference.reconstruction import SURFACE_SD, Options, reconstruct
 from training.cohorts.cohort import Case
 from training.rendering import STEPS, Surface, axes_around, show
 from training.surface_error import distances_to, true_points
@@ -33,7 +33,7 @@ def save_maps(model: ShapeModel, cases: Sequence[Case], drawing: DrawingName, pa
     for row, case in enumerate(cases):
         drawn = draw(case, drawing)
         mesh = reconstruct(model, drawn.stacks, Options(annotated=drawn.planes, resolution_mm=step)).mesh
-        sd, error = mesh.scalars["surface_sd_mm"], distances_to(true_points(case.mask, case.grid), mesh.vertices)
+        sd, error = mesh.scalars[SURFACE_SD], distances_to(true_points(case.mask, case.grid), mesh.vertices)
         scale = Normalize(0.0, float(np.quantile(np.concatenate([sd, error]), HIGHEST)))
         left, right = (axes_around(figure, (len(cases), 2, 2 * row + k), mesh.vertices) for k in (1, 2))
         show(left, _surface(mesh), _colours(mesh, sd, scale))

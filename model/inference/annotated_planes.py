@@ -1,6 +1,7 @@
 """Which planes of the stacks were looked at: by a rule of the interface, or by name."""
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -8,8 +9,9 @@ from jaxtyping import Float
 
 from model.errors import InconsistentStacks, InvalidMask, InvalidParameter
 from model.geometry import Grid
-from model.inference.mask_stack import MaskStack, Plane, index_box, occupied, section_of, world_box
+from model.inference.mask_stack import MaskStack, Plane, box_corners, index_box, occupied, section_of, world_box
 from model.inference.plane_cover import cover_planes
+from model.inference.stacks import EXCLUDED_VALUE
 
 AnnotatedRule = Literal["auto", "all", "nonempty"]
 
@@ -17,8 +19,6 @@ AnnotatedRule = Literal["auto", "all", "nonempty"]
 WORLD_GAP_MM = 200.0
 #: Spacings that differ by less than this share are equal.
 SPACING_TOLERANCE = 1e-3
-#: Fewest planes from which a shape can be reconstructed.
-FEWEST_PLANES = 2
 
 
 def find_planes(
@@ -29,7 +29,7 @@ def find_planes(
     ``all`` takes every plane along the axis of the largest spacing, ``nonempty`` those of them that hold
     foreground, ``auto`` the fewest planes along any axes that together hold all foreground
     (`model.inference.plane_cover`). A stack of a single slice has that one alone. Each stack is judged by itself;
-    planes are counted over all of them.
+    planes are counted over all of them, those that show the same place once (`lie_apart`).
     Planes without foreground are annotated by ``all`` and by name only: between two drawn slices of a
     sparse stack nobody has looked.
 
@@ -42,7 +42,8 @@ def find_planes(
 
     Raises:
         InvalidMask: fewer than two planes, or no foreground on them.
-        InvalidParameter: a named plane that its stack does not have, or fewer than two named.
+        InvalidParameter: a named plane that its stack does not have or that was never looked at, or fewer than two
+            named.
         InconsistentStacks: the foreground of some stacks over `gap_mm` from that of all others.
     """
     _check_same_world(stacks, gap_mm)
@@ -83,10 +84,41 @@ def _thickest_axes(grid: Grid) -> list[int]:
 
 
 def _check_count(stacks: Sequence[MaskStack], planes: tuple[Plane, ...]) -> None:
-    if len(planes) < FEWEST_PLANES:
+    if not lie_apart(stacks, planes):
         part = stacks[0].part if len(stacks) == 1 else "mask"
         found = "one slice only" if planes else "no annotated plane"
-        raise InvalidMask(f"{part} holds {found}; at least two annotated planes are needed", part=part)
+        raise InvalidMask(
+            f"{part} holds {found}; at least two annotated planes in different places are needed", part=part
+        )
+
+
+def lie_apart(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> bool:
+    """Whether two of the planes show different places, in one stack or in two.
+
+    A plane shows no more than another one if all that was looked at on it lies within half a slice spacing of the
+    other: the same slice of a second stack, or a row of voxels of a single slice.
+    """
+    return any(not _shows_no_more(stacks, *pair) for pair in combinations(planes, 2))
+
+
+def _shows_no_more(stacks: Sequence[MaskStack], first: Plane, second: Plane) -> bool:
+    spacing = min(stacks[plane.stack].grid.spacing[plane.axis] for plane in (first, second))
+    nearest = min(_farthest_mm(stacks, first, second), _farthest_mm(stacks, second, first))
+    return bool(nearest < spacing / 2)
+
+
+def _farthest_mm(stacks: Sequence[MaskStack], shown: Plane, other: Plane) -> float:
+    """How far what was looked at on a plane reaches from another plane."""
+    grid = stacks[other.stack].grid
+    index = grid.to_index(_looked_at(stacks[shown.stack], shown))[:, other.axis]
+    return float(np.abs(index - other.index).max() * grid.spacing[other.axis])
+
+
+def _looked_at(stack: MaskStack, plane: Plane) -> Float[np.ndarray, "8 3"]:
+    """World corners of the box around the voxels of a plane that were looked at."""
+    low, high = index_box(~np.take(stack.excluded, [plane.index], axis=plane.axis))
+    low[plane.axis] = high[plane.axis] = plane.index
+    return stack.grid.to_world(box_corners(low, high))
 
 
 def check_stacks(named: Sequence[Plane], count: int) -> None:
@@ -103,21 +135,34 @@ def check_stacks(named: Sequence[Plane], count: int) -> None:
 
 def _named_planes(stacks: Sequence[MaskStack], named: Sequence[Plane]) -> tuple[Plane, ...]:
     check_stacks(named, len(stacks))
+    positions: dict[Plane, int] = {}
     for position, plane in enumerate(named):
-        part = f"annotated[{position}]"
-        if not 0 <= plane.axis < 3:
-            raise InvalidParameter(f"{part} names axis {plane.axis}; 0 to 2 is accepted", part=part)
-        size = stacks[plane.stack].grid.shape[plane.axis]
-        if not 0 <= plane.index < size:
-            raise InvalidParameter(
-                f"{part} names plane {plane.index} along axis {plane.axis} of {stacks[plane.stack].part}; "
-                f"0 to {size - 1} is accepted",
-                part=part,
-            )
-    planes = tuple(sorted(set(named)))
-    if len(planes) < FEWEST_PLANES:
-        raise InvalidParameter("annotated must name at least two different planes", part="annotated")
+        positions.setdefault(plane, position)
+    for plane, position in positions.items():
+        _check_plane(stacks[plane.stack], plane, f"annotated[{position}]")
+    planes = tuple(sorted(positions))
+    if not lie_apart(stacks, planes):
+        raise InvalidParameter(
+            "annotated names one slice only; at least two planes in different places are needed", part="annotated"
+        )
     return planes
+
+
+def _check_plane(stack: MaskStack, plane: Plane, part: str) -> None:
+    if not 0 <= plane.axis < 3:
+        raise InvalidParameter(f"{part} names axis {plane.axis}; 0 to 2 is accepted", part=part)
+    size = stack.grid.shape[plane.axis]
+    if not 0 <= plane.index < size:
+        raise InvalidParameter(
+            f"{part} names plane {plane.index} along axis {plane.axis} of {stack.part}; 0 to {size - 1} is accepted",
+            part=part,
+        )
+    if section_of(stack.excluded, plane).all():
+        raise InvalidParameter(
+            f"{part} names a plane that was never looked at: it holds {EXCLUDED_VALUE} only; "
+            "a plane with any other value is accepted",
+            part=part,
+        )
 
 
 def _check_same_world(stacks: Sequence[MaskStack], gap_mm: float) -> None:

@@ -4,13 +4,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from trimesh import triangles
 
 from model.inference.mesh import Mesh
+from model.inference.nearest import candidate_faces, nearest_on_surface
 
-#: Faces, by their centres, among which the nearest one to a point is sought.
-CANDIDATES = 12
 #: Name of the scalar on a compared mesh.
 SIGNED_DISTANCE = "signed_distance_mm"
 
@@ -27,23 +25,9 @@ def signed_distance(points: Float[np.ndarray, "n 3"], surface: Mesh) -> Float[np
     The sign is that of the step from the nearest point along the surface's normals, interpolated there.
     """
     corners = surface.vertices[surface.faces]
-    count = min(CANDIDATES, len(corners))
-    near = np.asarray(cKDTree(corners.mean(axis=1)).query(points, k=[*range(1, count + 1)])[1])
-    closest, face = _closest(points, corners, near)
-    step = points - closest
-    normal = _normals_at(surface, face, closest)
-    return np.asarray(np.copysign(np.linalg.norm(step, axis=1), np.einsum("ij,ij->i", step, normal)))
-
-
-def _closest(
-    points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "f 3 3"], near: Int[np.ndarray, "n k"]
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
-    """Nearest point on the candidate faces of each point, and its face."""
-    closest_point: Any = triangles.closest_point
-    found = np.stack([closest_point(corners[candidate], points) for candidate in near.T], axis=1)
-    best = np.argmin(np.linalg.norm(found - points[:, None], axis=2), axis=1)
-    row = np.arange(len(points))
-    return found[row, best], near[row, best]
+    nearest = nearest_on_surface(points, corners, candidate_faces(points, corners))
+    normal = _normals_at(surface, nearest.faces, nearest.places)
+    return np.asarray(np.copysign(nearest.distance_mm, np.einsum("ij,ij->i", points - nearest.places, normal)))
 
 
 def _normals_at(

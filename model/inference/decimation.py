@@ -5,21 +5,17 @@ Edges are collapsed in the order of Garland and Heckbert's quadrics (Surface sim
 reduction taken that keeps it.
 """
 
-from typing import Any
-
 import fast_simplification
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
-from trimesh import triangles
 
 from model.errors import InvalidParameter
 from model.inference.mesh import Mesh, is_watertight, vertex_normals
+from model.inference.nearest import candidate_faces, nearest_on_surface
 
 #: Shares of the faces that are tried away; when none keeps the bound, the mesh stays as it is.
 REDUCTIONS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95)
-#: Faces, by their centres, among which the nearest one to a point is sought.
-CANDIDATES = 12
 #: A face is measured at its corners, and between them at as many steps as make its samples as dense as twice the other
 #: mesh's faces, at least 2 and at most so many.
 MOST_STEPS = 8
@@ -67,27 +63,14 @@ def hausdorff_mm(first: Mesh, second: Mesh) -> float:
 def _farthest(sampled: Mesh, other: Mesh) -> float:
     steps = int(np.clip(round(2.0 * (len(other.faces) / len(sampled.faces)) ** 0.5), 2, MOST_STEPS))
     points, corners = _samples(sampled, steps), other.vertices[other.faces]
-    count = min(CANDIDATES, len(corners))
-    near = np.asarray(cKDTree(corners.mean(axis=1)).query(points, k=[*range(1, count + 1)])[1])
-    distance = _nearest(points, corners, near[:, :2])
+    near = candidate_faces(points, corners)
+    distance = nearest_on_surface(points, corners, near[:, :2]).distance_mm
     # Only the largest is wanted: the other candidates are looked at for the points that may be it.
     far = distance >= np.quantile(distance, 0.95)
-    distance[far] = _nearest(points[far], corners, near[far])
+    distance[far] = nearest_on_surface(points[far], corners, near[far]).distance_mm
     far = distance > distance[far].max()
-    distance[far] = _nearest(points[far], corners, near[far])
+    distance[far] = nearest_on_surface(points[far], corners, near[far]).distance_mm
     return float(distance.max())
-
-
-def _nearest(
-    points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "f 3 3"], near: Int[np.ndarray, "n k"]
-) -> Float[np.ndarray, "n"]:
-    """Distance of each point to the nearest of its candidates."""
-    closest_point: Any = triangles.closest_point
-    distance = np.full(len(points), np.inf)
-    for candidate in near.T:
-        closest = closest_point(corners[candidate], points)
-        distance = np.minimum(distance, np.linalg.norm(closest - points, axis=1))
-    return distance
 
 
 def _samples(mesh: Mesh, steps: int) -> Float[np.ndarray, "n 3"]:

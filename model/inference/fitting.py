@@ -47,7 +47,7 @@ TRIAL_ITERATIONS, BEHIND_NATS, BEHIND_SHARE = 3, 10.0, (1.0, 0.25)
 def fit(model: ShapeModel, observations: Observations, options: FitOptions) -> Fit:
     """The best of the fits from every starting pose that the options allow, less planes that contradict the others."""
     starts = starts_of(model, observations, options, COARSE_SHARPNESS)
-    found = _from_starts(model, observations, starts, options)
+    found = fit_from(model, observations, starts, options)
     return _without_wrong_planes(model, observations, found, options) if options.robust else found
 
 
@@ -76,7 +76,7 @@ def _without_wrong_planes(
         trust[verdict.plane] = 0.0
         trusted = reweighted(observations, trust)
         poses = starting_poses(trusted, options)
-        anew = _from_starts(model, trusted, [Start(pose, pose) for pose in poses], options)
+        anew = fit_from(model, trusted, [Start(pose, pose) for pose in poses], options)
         on = _from_place(model, trusted, found, poses[0], options)
         found = min(anew, on, key=lambda one: one.objective)
     return replace(found, plane_weights=trust, doubted=doubted)
@@ -96,12 +96,7 @@ def refit(model: ShapeModel, observations: Observations, found: Fit, options: Fi
     return replace(anew, plane_weights=found.plane_weights, doubted=found.doubted, rival=found.rival)
 
 
-def fit_from(model: ShapeModel, observations: Observations, start: Pose, options: FitOptions) -> Fit:
-    """Fit from one starting pose (world to canonical) and the centre of the latent space."""
-    return _from_starts(model, observations, [Start(start, start)], options)
-
-
-def _from_starts(model: ShapeModel, observations: Observations, starts: Sequence[Start], options: FitOptions) -> Fit:
+def fit_from(model: ShapeModel, observations: Observations, starts: Sequence[Start], options: FitOptions) -> Fit:
     """The best of the fits from several starts; those that fall behind early are not finished."""
     coarse = _coarse(model, observations, starts, options, _give_up_those_behind)
     last = _limit(coarse, BEHIND_SHARE[1])

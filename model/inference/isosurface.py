@@ -68,7 +68,7 @@ def extract_surface(
     """
     factor = coarse_factor or _coarse_factor(lower, upper, step_mm)
     refinement = Refinement(lower, upper, step_mm, factor, steepest)
-    polygons = _polygons(refinement, lambda: field(refinement.query()))
+    polygons = _polygons(refinement, field)
     if polygons is None:
         return empty_mesh()
     mesh = mesh_of(lower + step_mm * polygons.places, polygons.faces)
@@ -77,25 +77,9 @@ def extract_surface(
     return mesh if keep_specks else largest_component(mesh)[0]
 
 
-def polygonise(values: Float[np.ndarray, "i j k"], lower: Float[np.ndarray, "3"], step_mm: float) -> Mesh:
-    """Zero surface of a dense grid, positive inside, capped half a step outside the border.
-
-    Args:
-        values: at nodes ``lower + step_mm * (i, j, k)``.
-    """
-    upper = lower + step_mm * (np.array(values.shape) - 1)
-    refinement = Refinement(lower, upper, step_mm, 1)
-    polygons = _polygons(refinement, lambda: values[tuple(refinement.wanted().T)])
-    return empty_mesh() if polygons is None else mesh_of(lower + step_mm * polygons.places, polygons.faces)
-
-
-def _polygons(refinement: Refinement, evaluate: Callable[[], Float[np.ndarray, "n"]]) -> Polygons | None:
-    """Polygons of the finest grid, its values changed where they would not be two-manifold; None where it is empty.
-
-    Args:
-        evaluate: values at the points that the refinement wants.
-    """
-    _complete(refinement, evaluate)
+def _polygons(refinement: Refinement, field: Field) -> Polygons | None:
+    """Polygons of the finest grid, its values changed where they would not be two-manifold; None where it is empty."""
+    _complete(refinement, field)
     cells, values = refinement.crossed()
     if not len(cells):
         return None
@@ -104,14 +88,14 @@ def _polygons(refinement: Refinement, evaluate: Callable[[], Float[np.ndarray, "
         return polygons
     while len(nodes := checkered_nodes(cells, values)):
         refinement.raise_nodes(nodes, RAISED)
-        _complete(refinement, evaluate)
+        _complete(refinement, field)
         cells, values = refinement.crossed()
     return polygons_of(cells, values)
 
 
-def _complete(refinement: Refinement, evaluate: Callable[[], Float[np.ndarray, "n"]]) -> None:
-    while len(refinement.wanted()):
-        refinement.update(evaluate())
+def _complete(refinement: Refinement, field: Field) -> None:
+    while len(points := refinement.query()):
+        refinement.update(field(points))
 
 
 def _settled(

@@ -31,10 +31,12 @@ FEWEST_JUDGED = 4
 PLANES_PER_WRONG = 4
 #: Planes that stand out by this factor on few observations are tried on all.
 TRIAL_RATIO = 2.5
-#: The plane blamed gains so many times, and so many nats, more than is typical.
+#: The plane blamed gains so many times, and so many nats, more than is typical, of so many planes.
 BLAME_RATIO, BLAME_NATS = 4.0, 20.0
 #: The plane doubted gains so many times, and so many nats, more.
 DOUBT_RATIO, DOUBT_NATS = 3.0, 15.0
+#: Of more planes than this, the one that stands out most has to do so by more: by this power of their number.
+FEW_PLANES, DEMAND = 8, 1.0 / 3.0
 #: A thorough search is for drawings of no more planes than this.
 MOST_SEARCHED = 12
 #: What a plane's gain is held against is at least this share of the median plane's.
@@ -58,11 +60,13 @@ class Verdict:
         plane: its number.
         gain: decrease of the objective (nats).
         typical: what it would be if the plane agreed with the others as they do among themselves (nats).
+        among: how many planes it is the worst of.
     """
 
     plane: int
     gain: float
     typical: float
+    among: int
 
     @property
     def excess(self) -> float:
@@ -77,12 +81,16 @@ class Verdict:
     @property
     def blamed(self) -> bool:
         """Whether the plane contradicts all others."""
-        return self.ratio > BLAME_RATIO and self.excess > BLAME_NATS
+        return self._stands_out(BLAME_RATIO, BLAME_NATS)
 
     @property
     def doubted(self) -> bool:
         """Whether it stands out, though perhaps for the shape's sake."""
-        return self.ratio > DOUBT_RATIO and self.excess > DOUBT_NATS
+        return self._stands_out(DOUBT_RATIO, DOUBT_NATS)
+
+    def _stands_out(self, ratio: float, nats: float) -> bool:
+        demand = max(1.0, self.among / FEW_PLANES) ** DEMAND
+        return bool(self.ratio > demand * ratio and self.excess > demand * nats)
 
 
 def most_wrong(observations: Observations) -> int:
@@ -162,7 +170,7 @@ def _verdict(whole: Objective, value: float, point: Point, number: int, seen: In
     after = whole.by_plane(place)
     rest = whole.gathered(place, [term for plane, term in enumerate(after) if plane != number])
     typical = typical_gains(after, leave_out_gains(after, rest.curvature, seen[seen != number]))
-    return Verdict(number, value - point.value, float(typical[number]))
+    return Verdict(number, value - point.value, float(typical[number]), len(seen))
 
 
 def _without_each(observations: Observations, numbers: Int[np.ndarray, "s"]) -> list[Observations]:

@@ -163,14 +163,6 @@ def to_trimesh(mesh: Mesh) -> trimesh.Trimesh:
     return result
 
 
-def from_trimesh(mesh: trimesh.Trimesh) -> Mesh:
-    """A trimesh as a `Mesh`; vertex attributes of one value a vertex become scalars."""
-    attributes = {name: np.asarray(values) for name, values in mesh.vertex_attributes.items()}
-    scalars = {name: values.reshape(-1) for name, values in attributes.items() if values.size == len(mesh.vertices)}
-    normals = np.array(mesh.vertex_normals, float)
-    return Mesh(np.array(mesh.vertices, float), np.array(mesh.faces, np.int64), normals, scalars)
-
-
 def _middle(vertices: np.ndarray) -> np.ndarray:
     return vertices.mean(axis=0) if len(vertices) else np.zeros(3)
 

@@ -28,7 +28,7 @@ FARTHEST_SD = 5.0
 VERTICES = 384
 #: A surface is looked for no farther than this (mm) from the mean one.
 REACH_MM = 20.0
-#: Shares of the surface's variance for which active dimensions are counted (MorphoFlow paper).
+#: Shares of the variance for which active dimensions are counted (MorphoFlow paper).
 VARIANCE_SHARES = (0.95, 0.97, 0.99)
 
 
@@ -72,9 +72,17 @@ class ShapeModes:
 
     def active(self) -> tuple[int, int, int]:
         """How many modes, by rank, explain 95, 97 and 99 % of the surface's variance."""
-        cumulative = [mode.cumulative_variance for mode in self.ranked]
-        counts = [int(np.searchsorted(cumulative, share - 1e-12)) + 1 for share in VARIANCE_SHARES]
-        return counts[0], counts[1], counts[2]
+        return active_counts(np.array([mode.cumulative_variance for mode in self.ranked]))
+
+
+def active_counts(cumulative: Float[np.ndarray, "d"]) -> tuple[int, int, int]:
+    """How many dimensions, largest first, hold each of `VARIANCE_SHARES`.
+
+    Args:
+        cumulative: share of the variance that each holds together with those before it.
+    """
+    low, middle, high = (int(np.searchsorted(cumulative, share - 1e-12)) + 1 for share in VARIANCE_SHARES)
+    return low, middle, high
 
 
 def shape_modes(model: ShapeModel) -> ShapeModes:

@@ -134,11 +134,3 @@ def normal_displacements(
     """Outward movement of each surface point (mm) for a unit of each parameter."""
     slope = np.linalg.norm(by_point, axis=1, keepdims=True)
     return np.asarray(by_parameter / np.maximum(slope, 1e-6))
-
-
-def parameter_draws(covariance: Float[np.ndarray, "p p"], count: int, seed: int) -> Float[np.ndarray, "c p"]:
-    """Steps around the optimum drawn from the posterior, in antithetic pairs."""
-    half = np.random.default_rng(seed).standard_normal((count // 2, len(covariance)))
-    values, vectors = np.linalg.eigh(covariance)
-    steps = half * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
-    return np.concatenate([steps, -steps])

@@ -24,6 +24,7 @@ from model.inference.mask_stack import common_space
 from model.inference.mesh import Mesh
 from model.inference.objective import Place, reweighted
 from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
+from model.inference.one_body import separate_warnings
 from model.inference.posterior import FieldDerivatives, fitted_logits, laplace_covariance
 from model.inference.reliability import figures_of, less_trusting, reliability_warnings, thickness_warnings
 from model.inference.rivals import rival_warnings
@@ -40,6 +41,8 @@ from model.inference.uncertainty import ShapeState, area_estimate, surface_sprea
 UncertaintyRule = Literal["laplace", "ensemble", "none"]
 #: Called with the name of each stage as it begins: observations, fit, surface, uncertainty.
 Watch = Callable[[str], None]
+#: Scalar of a surface: standard deviation along its normal (mm).
+SURFACE_SD = "surface_sd_mm"
 
 #: Point observations used of all voxels on the annotated planes.
 OBSERVATION_BUDGET = 2500
@@ -101,7 +104,7 @@ class Reconstruction:
 
     Attributes:
         state: evaluates the field; `occupancy` takes it.
-        mesh: watertight surface; with uncertainty its scalar ``surface_sd_mm`` is there.
+        mesh: watertight surface; with uncertainty its scalar `SURFACE_SD` is there.
         planes: planes that were used.
         observation_count: number of point observations.
         residuals: disagreement of each plane.
@@ -131,11 +134,15 @@ def farthest_mm(model: ShapeModel) -> float:
     return 2.0 * max(model.manifest.half_extent_mm)
 
 
+def unwatched(_: str) -> None:
+    """A `Watch` that does nothing."""
+
+
 def reconstruct(
     model: ShapeModel,
     stacks: Sequence[MaskStack],
     options: Options,
-    watch: Watch = lambda stage: None,
+    watch: Watch = unwatched,
     max_voxels: int | None = None,
 ) -> Reconstruction:
     """Fit the model to the stacks and extract surface and uncertainty.
@@ -174,7 +181,8 @@ def reconstruct(
     plain_sd = None if sd_mm is None or state.covariance is None else uncalibrated(model, sd_mm)
     trusted = observations if found.plane_weights is None else reweighted(observations, found.plane_weights)
     space = common_space(stacks)
-    sections = sections_of(observations, fitted_logits(model, found, observations.points), found.plane_weights)
+    logits = fitted_logits(model, found, observations.points)
+    sections = sections_of(observations, logits, found.plane_weights)
     figures = figures_of(model, found, stacks, drawing, mesh, usual, plain_sd)
     thick = thickness_warnings(stacks, observations.planes, mesh)
     density, percentile = typicality(model, found, replace(figures, misfit_mm=0.0) if thick else figures)
@@ -195,6 +203,7 @@ def reconstruct(
         log_prior_density=density,
         typicality_percentile=percentile,
         warnings=_warnings(found, options)
+        + separate_warnings(observations, logits, mesh)
         + rival_warnings(found)
         + typicality_warnings(model, percentile)
         + plane_warnings(sections, _doubted(observations, found))
@@ -238,7 +247,7 @@ def _delivered(
         mesh, derivatives = _surface(model, state.fits[0], options, options.resolution_mm)
         spread = surface_spread(model, state, mesh, derivatives)
         sd_mm = None if spread is None else spread.sd()
-    return mesh if sd_mm is None else replace(mesh, scalars={"surface_sd_mm": sd_mm})
+    return mesh if sd_mm is None else replace(mesh, scalars={SURFACE_SD: sd_mm})
 
 
 def _require_room(model: ShapeModel, options: Options, max_voxels: int | None, found: Fit | None = None) -> None:

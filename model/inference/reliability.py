@@ -233,6 +233,6 @@ def thickness_warnings(stacks: Sequence[MaskStack], planes: Sequence[Plane], mes
         return ()
     sentence = (
         f"Slices are {np.median(thickness):.1f} mm thick, much compared with the object; what changes within a slice "
-        "was not seen, do not rely on details."
+        "was not seen. Do not rely on details, nor on the intervals."
     )
     return (sentence,)

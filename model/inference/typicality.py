@@ -3,15 +3,18 @@
 A shape of another kind either needs a code that the prior holds for unlikely, or is one that no code expresses, so
 that the contours stay far from it. Both are held against what answers to sound drawings of real shapes look like
 (`Manifest.typical`): the code of a sparse drawing is drawn towards the middle of the population, and has another
-density than one that was trained on a dense mask. A figure that is worse than usual by ``z`` SDs has the tail
-probability of Student's distribution, the predictive one for estimates from few shapes; the less probable one counts,
-doubled because two were looked at. More planes than were measured with take the code farther from the middle than any
-sparse drawing would: then the misfit is judged alone.
+density than one that was trained on a dense mask. How far a density lies below that of the mean shape is distributed
+much like a chi square, whose cube root is nearly normal (Wilson and Hilferty 1931); so is the logarithm of a misfit. A
+figure that is worse than usual by ``z`` SDs has the tail probability of Student's distribution, the predictive one for
+estimates from few shapes. The less probable of the two counts, for what the least of two is (Sidak 1967). More planes
+than were measured with take the code farther from the middle than any sparse drawing would: then the misfit is judged
+alone.
 """
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 from scipy.special import stdtr
 
 from model.bundle import ShapeModel
@@ -26,6 +29,17 @@ ATYPICAL_PERCENTILE, ATYPICAL_BY_DENSITY = 0.1, 1.0
 SURPRISING = 1e-3
 
 
+def peak_density(model: ShapeModel) -> float:
+    """Log prior density (nats) of the code of the mean shape, ``z0 = 0``."""
+    mean = model.prior.from_base(np.zeros((1, model.prior.latent_size)))
+    return float(model.prior.log_density(mean)[0][0])
+
+
+def rarity(densities: Float[np.ndarray, "n"], peak: float) -> Float[np.ndarray, "n"]:
+    """Cube roots of how far log prior densities (nats) lie below the mean shape's."""
+    return np.cbrt(np.maximum(peak - densities, 0.0))
+
+
 def typicality(model: ShapeModel, found: Fit, figures: Figures) -> tuple[float, float]:
     """Log prior density of the fitted code (nats), and the percentile of the shape among real ones.
 
@@ -38,11 +52,12 @@ def typicality(model: ShapeModel, found: Fit, figures: Figures) -> tuple[float, 
         return density, float(100.0 * np.mean(model.population.log_densities < density))
     tails = []
     if figures.planes <= MOST_USUAL_PLANES or not figures.misfit_mm > 0.0:
-        tails.append(_tail(known, (known["density_mean"] - density) / known["density_sd"]))
+        rare = float(rarity(np.array([density]), known["density_peak"])[0])
+        tails.append(_tail(known, (rare - known["rarity_mean"]) / known["rarity_sd"]))
     if figures.misfit_mm > 0.0:
         usual = known["misfit_mean"] + known["misfit_exponent"] * np.log(usual_share(figures.planes))
         tails.append(_tail(known, (np.log(figures.misfit_mm) - usual) / known["misfit_sd"]))
-    return density, 100.0 * min(1.0, len(tails) * min(tails))
+    return density, 100.0 * (1.0 - (1.0 - min(tails)) ** len(tails))
 
 
 def typicality_warnings(model: ShapeModel, percentile: float) -> tuple[str, ...]:
@@ -58,12 +73,17 @@ def predictive_probabilities(model: ShapeModel, sections: Sequence[Section]) -> 
 
     A posterior predictive check (Gelman, Meng and Stern 1996) of the cross-entropy of the labels relative to that of
     labels drawn from the field. Labels are not independent, so its distribution is that over sound drawings. None
-    where the model does not know it.
+    where the model does not know it. The more planes, the less a code can follow all of them: where there are more
+    than were measured with, they are held against each other.
     """
     known = model.manifest.typical
     if not known:
         return [None for _ in sections]
-    return [_tail(known, (section.surprise - known["slice_mean"]) / known["slice_sd"]) for section in sections]
+    surprises = np.array([section.surprise for section in sections])
+    usual, spread = known["slice_mean"], known["slice_sd"]
+    if len(sections) > MOST_USUAL_PLANES:
+        usual, spread = max(usual, float(np.median(surprises))), max(spread, float(surprises.std()))
+    return [_tail(known, (surprise - usual) / spread) for surprise in surprises]
 
 
 def predictive_warnings(

@@ -6,6 +6,7 @@ Arrays are stored exactly and without pickling; everything else is JSON.
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -45,22 +46,46 @@ def read_document(folder: Path) -> dict[str, Any]:
     Raises:
         OSError, ValueError: it is not there or not of this format.
     """
-    document: dict[str, Any] = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-    if document.get("archive") != ARCHIVE_VERSION:
+    return parse_document((folder / SUMMARY).read_bytes())
+
+
+def parse_document(content: bytes) -> dict[str, Any]:
+    """The document of such a file, with the times of the result's life.
+
+    Raises:
+        ValueError: it is not of this format.
+    """
+    try:
+        document: dict[str, Any] = json.loads(content)
+        version, _ = document["archive"], [moment(document[name]) for name in ("created", "expires")]
+    except (LookupError, TypeError, OverflowError, OSError, RecursionError) as fault:
+        raise ValueError("no document of a result") from fault
+    if version != ARCHIVE_VERSION:
         raise ValueError("written in another format")
     return document
+
+
+def moment(seconds: float) -> datetime:
+    """Seconds since 1970 as a time of day."""
+    return datetime.fromtimestamp(seconds, UTC)
 
 
 def read_outcome(folder: Path, document: dict[str, Any]) -> Outcome:
     """The outcome that `write_outcome` wrote.
 
     Raises:
-        OSError, ValueError, KeyError: a file is missing or damaged.
+        OSError, ValueError: a file is missing or damaged.
     """
-    with np.load(folder / STATE, allow_pickle=False) as arrays:
-        state = _state(dict(arrays), document["fits"])
-    with np.load(folder / MESH, allow_pickle=False) as arrays:
-        mesh = _mesh(dict(arrays))
+    try:
+        return _outcome(folder, document)
+    except (OSError, MemoryError):
+        raise
+    except Exception as fault:
+        raise ValueError("damaged") from fault  # libraries stumble over damaged files in many ways
+
+
+def _outcome(folder: Path, document: dict[str, Any]) -> Outcome:
+    state, mesh = _state(_arrays(folder / STATE), document["fits"]), _mesh(_arrays(folder / MESH))
     answer = document["reconstruction"]
     reconstruction = Reconstruction(
         state=state,
@@ -84,6 +109,11 @@ def read_outcome(folder: Path, document: dict[str, Any]) -> Outcome:
     return Outcome(
         model["name"], model["version"], model["digest"], _options(document["options"]), grid, reconstruction
     )
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:  # else damage leaves the file open
+        return dict(arrays)
 
 
 def _document(outcome: Outcome) -> dict[str, Any]:

@@ -20,10 +20,10 @@ class FolderBlobs:
         """Write a file, over an older one; on the disk when this returns."""
         self._write(key, lambda file: file.write(data))
 
-    def put_file(self, key: str, path: Path) -> None:
-        """Write a copy of a file."""
-        with path.open("rb") as source:
-            self._write(key, lambda file: shutil.copyfileobj(source, file))
+    def put_file(self, key: str, file: BinaryIO) -> None:
+        """Write a copy of an open file from its beginning."""
+        file.seek(0)
+        self._write(key, lambda target: shutil.copyfileobj(file, target))
 
     def get(self, key: str) -> bytes:
         """Content of a file; `FileNotFoundError` when it is not there."""

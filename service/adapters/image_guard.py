@@ -4,8 +4,6 @@ Headers are read from the first kilobytes. The number of voxels that they claim 
 integers that cannot overflow, and compressed voxels are inflated no further than the claim.
 """
 
-import bz2
-import gzip
 import io
 import math
 import zlib
@@ -13,18 +11,21 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
 from model.errors import InvalidMask, TooLarge, UnreadableImage
 from model.geometry import ras_to
+from service.adapters.inflating import Readable, inflating
 
 #: Bytes of an image: held, on disk, or an open binary file that can seek.
 Source = bytes | Path | BinaryIO
 #: Longest text header that is read.
 HEADER_LIMIT = 1 << 20
+#: Most axes that an image may claim, as in NIfTI; those beyond the third have one voxel.
+MAX_AXES = 7
 #: Bytes beyond the claimed voxels that are tolerated (padding).
 TRAILING_LIMIT = 1 << 16
 #: From LPS to RAS mm, and back.
@@ -87,9 +88,12 @@ def checked_shape(shape: Sequence[int], part: str, limits: ImageLimits) -> tuple
     """The shape a header claims, as exact integers.
 
     Raises:
+        InvalidMask: more than `MAX_AXES` axes.
         UnreadableImage: an axis without voxels.
         TooLarge: over ``max_voxels``.
     """
+    if len(shape) > MAX_AXES:
+        raise InvalidMask(f"{part} has more than {MAX_AXES} dimensions; a 3-D mask is accepted", part=part)
     exact = tuple(int(extent) for extent in shape)
     if not exact or min(exact) < 1:
         raise UnreadableImage(
@@ -125,7 +129,7 @@ def inflated(file: BinaryIO, encoding: str, size: int, part: str) -> Iterator[by
     """
     read = 0
     try:
-        for piece in _read_at_most(_decompressor(file, encoding), size + TRAILING_LIMIT + 1):
+        for piece in _read_at_most(inflating(file, encoding), size + TRAILING_LIMIT + 1):
             yield piece[: max(0, size - read)]
             read += len(piece)
     except (OSError, EOFError, zlib.error) as error:
@@ -140,41 +144,17 @@ def inflated(file: BinaryIO, encoding: str, size: int, part: str) -> Iterator[by
         )
 
 
-def _decompressor(file: BinaryIO, encoding: str) -> Any:
-    if encoding == "gzip":
-        return gzip.GzipFile(fileobj=file, mode="rb")
-    if encoding == "bzip2":
-        return bz2.BZ2File(file)
-    if encoding == "zlib":
-        return _ZlibReader(file)
-    return file
+def inflated_head(file: BinaryIO, size: int) -> bytes:
+    """The first bytes of a gzip file, inflated: at most so many, and none where they are damaged."""
+    file.seek(0)
+    try:
+        return b"".join(_read_at_most(inflating(file, "gzip"), size))
+    except (OSError, EOFError, zlib.error):
+        return b""
 
 
-def _read_at_most(stream: Any, limit: int) -> Iterator[bytes]:
+def _read_at_most(stream: Readable, limit: int) -> Iterator[bytes]:
     left = limit
     while left > 0 and (piece := stream.read(min(CHUNK, left))):
         left -= len(piece)
         yield piece
-
-
-class _ZlibReader:
-    """Reads a zlib stream without a gzip header, a bounded piece at a time."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._inflate = zlib.decompressobj()
-
-    def read(self, size: int) -> bytes:
-        """At most so many bytes; empty at the stream's end.
-
-        Raises:
-            EOFError: the file ends within the stream.
-        """
-        while not self._inflate.eof:
-            piece = self._inflate.unconsumed_tail or self._file.read(CHUNK)
-            if not piece:
-                raise EOFError
-            data = self._inflate.decompress(piece, size)
-            if data:
-                return data
-        return b""

@@ -57,7 +57,7 @@ def read_mask(source: Source, part: str, limits: ImageLimits, labels: frozenset[
     checked_labels(labels)
     # Affines from hostile headers may overflow on the way; make_stack refuses what comes of it.
     with opened(source, part, limits) as file, np.errstate(all="ignore"):
-        volume = _read(file, part, limits, labels_named=labels is not None)
+        volume = _read(file, part, limits, labels)
     return make_stack(part, volume.values, volume.affine, labels)
 
 
@@ -76,12 +76,12 @@ def image_format(file: BinaryIO) -> ImageFormat | None:
     return "nifti" if known else None
 
 
-def _read(file: BinaryIO, part: str, limits: ImageLimits, *, labels_named: bool) -> Volume:
+def _read(file: BinaryIO, part: str, limits: ImageLimits, labels: frozenset[int] | None) -> Volume:
     found = image_format(file)
     if found == "nifti":
         return read_nifti(file, part, limits)
     if found == "nrrd":
-        return read_nrrd(file, part, limits, labels_named=labels_named)
+        return read_nrrd(file, part, limits, labels)
     if found == "metaimage":
         return read_metaimage(file, part, limits)
     raise UnreadableImage(

@@ -24,6 +24,7 @@ from model.errors import InvalidParameter
 from model.geometry import Space
 from model.inference.mesh import Mesh, to_trimesh, transformed
 from service.adapters.image_guard import LPS_TO_RAS
+from service.colours import RAMP, SIGNED_RAMP
 
 Writer = Callable[[Mesh, Mapping[str, str]], bytes]
 
@@ -34,10 +35,6 @@ MZ3_MAGIC = 0x5A4D
 MZ3_HAS_FACES, MZ3_HAS_VERTICES, MZ3_HAS_SCALARS = 1, 2, 8
 #: ZIP has no earlier date; a fixed one keeps the bytes the same.
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
-#: From low to high (RGB): pale, orange, dark red; told apart in grey and by the colour-blind.
-RAMP = ((255, 245, 235), (241, 105, 19), (127, 39, 4))
-#: The same for scalars of both signs, from the most negative: blue, nearly white, dark orange.
-SIGNED_RAMP = ((5, 48, 97), (67, 147, 195), (247, 247, 247), (241, 105, 19), (127, 39, 4))
 
 
 def write_mesh(mesh: Mesh, format: str, *, space: str = "RAS", metadata: Mapping[str, object]) -> bytes:

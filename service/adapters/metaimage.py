@@ -67,7 +67,7 @@ def read_metaimage(file: BinaryIO, part: str, limits: ImageLimits) -> Volume:
             part=part,
         )
     shape = _shape(fields, part, limits)
-    affine = _affine(fields, part)
+    affine = _affine(fields, len(shape), part)
     order = ">" if _is_true(fields, "ElementByteOrderMSB") else "<"
     if fields.get("ElementType") not in VOXEL_TYPES or not _is_true(fields, "BinaryData", "True"):
         raise UnreadableImage(f"{part} has voxels of an unknown type; binary numbers are accepted", part=part)
@@ -113,9 +113,8 @@ def _shape(fields: dict[str, str], part: str, limits: ImageLimits) -> tuple[int,
     return shape
 
 
-def _affine(fields: dict[str, str], part: str) -> Float[np.ndarray, "4 4"]:
+def _affine(fields: dict[str, str], axes: int, part: str) -> Float[np.ndarray, "4 4"]:
     """Voxel index to world RAS mm; axes beyond the third, which have one voxel, are left out."""
-    axes = int(fields["NDims"])
     spacing = fields.get("ElementSpacing", fields.get("ElementSize"))
     if spacing is None:
         raise InvalidGeometry(f"{part} names no voxel spacing; an ElementSpacing in mm is needed", part=part)
@@ -128,10 +127,10 @@ def _affine(fields: dict[str, str], part: str) -> Float[np.ndarray, "4 4"]:
 
 
 def _numbers(text: str, count: int, part: str) -> Float[np.ndarray, "n"]:
+    words = text.split()
+    if len(words) != count:
+        raise _damaged(part)
     try:
-        numbers = np.array([float(word) for word in text.split()])
+        return np.array([float(word) for word in words])
     except ValueError as error:
         raise _damaged(part) from error
-    if len(numbers) != count:
-        raise _damaged(part)
-    return numbers

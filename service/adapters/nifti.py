@@ -7,7 +7,6 @@ names no unit is in mm.
 """
 
 import gzip
-import zlib
 from typing import Any, BinaryIO
 
 import nibabel as nib
@@ -23,6 +22,7 @@ from service.adapters.image_guard import (
     Volume,
     checked_dimensions,
     checked_shape,
+    inflated_head,
 )
 from service.adapters.voxels import Scaling, Stored, read_voxels
 
@@ -40,12 +40,8 @@ GZIP_MAGIC = b"\x1f\x8b"
 def nifti_head(file: BinaryIO) -> bytes:
     """The first bytes of the file, inflated when it is gzip; empty when they cannot be."""
     file.seek(0)
-    zipped = file.read(2) == GZIP_MAGIC
-    file.seek(0)
-    try:
-        return (gzip.GzipFile(fileobj=file, mode="rb").read(HEAD_SIZE) if zipped else file.read(HEAD_SIZE)) or b""
-    except (OSError, EOFError, zlib.error):
-        return b""
+    head = file.read(HEAD_SIZE)
+    return inflated_head(file, HEAD_SIZE) if head.startswith(GZIP_MAGIC) else head
 
 
 def is_nifti(head: bytes) -> bool:

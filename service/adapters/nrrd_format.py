@@ -1,13 +1,13 @@
 """NRRD with its voxels in the same file, and 3-D Slicer's segmentations (.seg.nrrd).
 
 The declared space (RAS, LPS or LAS) is converted to RAS; a file that declares none is LPS, as ITK reads
-it. A segmentation whose segments overlap has a leading axis of layers, each a label map of its own: they
-are laid on top of each other when all labels are wanted. A label's value is then ambiguous, so naming
-one is refused.
+it. A segmentation whose segments overlap has a leading axis of layers, which are laid on top of each other
+(`service.adapters.nrrd_layers`).
 """
 
 import re
 import warnings
+from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
 import nrrd
@@ -23,6 +23,7 @@ from service.adapters.image_guard import (
     checked_dimensions,
     checked_shape,
 )
+from service.adapters.nrrd_layers import checked_layers, layers_by_value, merged
 from service.adapters.voxels import Stored, read_voxels
 
 MAGIC = b"NRRD00"
@@ -52,6 +53,16 @@ TO_RAS = {
 MM_PER_UNIT = {"mm": 1.0, "millimeter": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "micron": 1e-3}
 #: Kinds of an axis that counts layers of a segmentation.
 LAYER_KINDS = ("list", "vector")
+#: Fields that say where the voxels are when they are in another file.
+DETACHED = ("data file", "datafile")
+#: Fields that are read; pynrrd takes time and memory that grow with the square of what others hold.
+FIELDS = (
+    *("type", "dimension", "sizes", "encoding", "endian", "kinds", "spacings"),
+    *("space", "space dimension", "space directions", "space origin", "space units"),
+    *("line skip", "lineskip", "byte skip", "byteskip"),
+)
+#: Longest of them (characters).
+FIELD_LIMIT = 1 << 12
 _END_OF_HEADER = re.compile(rb"\r?\n\r?\n")
 
 
@@ -60,52 +71,86 @@ def is_nrrd(head: bytes) -> bool:
     return head.startswith(MAGIC)
 
 
-def read_nrrd(file: BinaryIO, part: str, limits: ImageLimits, *, labels_named: bool) -> Volume:
+def read_nrrd(file: BinaryIO, part: str, limits: ImageLimits, labels: frozenset[int] | None) -> Volume:
     """Values and affine; layers of a segmentation are merged.
 
     Args:
-        labels_named: whether the caller will pick labels by value.
+        labels: values that the caller will pick; all when None.
 
     Raises:
         UnreadableImage: voxels in another file, a damaged header, or fewer voxels than it claims.
         TooLarge: more voxels than accepted, or more data than claimed.
-        InvalidMask: not 3-D, voxels that are no plain numbers, or named labels in overlapping layers.
+        InvalidMask: not 3-D, voxels that are no plain numbers, or a label of several segments in overlapping layers.
         InvalidGeometry: no spacing, or a space that is not anatomical.
     """
-    fields = _header(file, part)
-    if "data file" in fields or "datafile" in fields:
-        raise UnreadableImage(
-            f"{part} keeps its voxels in another file; an NRRD with them in the same file is accepted", part=part
-        )
+    header = _header(file, part)
+    fields = _parsed(header, part)
     shape = checked_shape(fields.get("sizes", ()), part, limits)
     layered = _has_layers(fields, shape)
     checked_dimensions(shape[1:] if layered else shape, part)
-    if layered and shape[0] > 1 and labels_named:
-        raise InvalidMask(
-            f"{part} has overlapping segments, whose label values are ambiguous; "
-            "a segmentation without overlaps, or no label, is accepted",
-            part=part,
-        )
+    if layered:
+        checked_layers(shape[0], part)
     affine = _affine(fields, part, first_axis=int(layered))
     values = _values(file, fields, shape, part, limits)
-    return Volume(values.max(axis=0) if layered and values.shape == shape else values, affine)
+    if layered and values.shape == shape:
+        values = merged(values, labels, layers_by_value(header.pairs), part)
+    return Volume(values, affine)
 
 
-def _header(file: BinaryIO, part: str) -> dict[str, Any]:
-    """Fields by name; leaves the file where the voxels begin."""
+@dataclass(frozen=True)
+class _Header:
+    """What a header says, as it is written: its version, fields and key/value pairs."""
+
+    version: str
+    fields: dict[str, str] = field(default_factory=dict)
+    pairs: dict[str, str] = field(default_factory=dict)
+
+
+def _header(file: BinaryIO, part: str) -> _Header:
+    """The header in front of voxels; leaves the file where they begin."""
     file.seek(0)
     head = file.read(HEADER_LIMIT)
     end = _END_OF_HEADER.search(head)
+    header = _split(head[: end.start()] if end else head, part)
+    if not header.fields.keys().isdisjoint(DETACHED):
+        raise UnreadableImage(
+            f"{part} keeps its voxels in another file; an NRRD with them in the same file is accepted", part=part
+        )
     if end is None:
         raise _damaged(part)
     file.seek(end.end())
+    return header
+
+
+def _split(head: bytes, part: str) -> _Header:
+    version, *lines = (line.decode("ascii", "ignore").rstrip() for line in head.splitlines())
+    header = _Header(version)
+    for line in lines:
+        name, sign, value = (word.strip() for word in line.partition(":"))
+        if line.startswith("#"):
+            continue
+        if value.startswith("="):
+            header.pairs.setdefault(name, value[1:].strip())
+        elif sign and name not in header.fields:
+            header.fields[name] = value
+        else:
+            raise _damaged(part)
+    return header
+
+
+def _parsed(header: _Header, part: str) -> dict[str, Any]:
+    known = {name: header.fields[name] for name in FIELDS if name in header.fields}
+    if any(len(value) > FIELD_LIMIT for value in known.values()):
+        raise UnreadableImage(
+            f"{part} has an NRRD header with a field of over {FIELD_LIMIT} characters; shorter ones are accepted",
+            part=part,
+        )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            parsed = nrrd.read_header(head[: end.start()].splitlines())
+            return dict(nrrd.read_header([header.version, *(f"{name}: {value}" for name, value in known.items())]))
     except (nrrd.NRRDError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise _damaged(part) from error
-    return dict(parsed)
 
 
 def _damaged(part: str) -> UnreadableImage:

@@ -23,12 +23,15 @@ from model.errors import MorphoFlowError
 from model.inference.reconstruction import Watch
 from model.interruption import Check
 from service.errors import Abandoned, HelperLost
+from service.observability import Log
 
 T = TypeVar("T")
 #: How often (s) a call asks whether its answer is still wanted.
 CHECK_S = 0.05
 #: A helper that was told to end has ended after so long (s), one way or the other.
 LEAVE_WITHIN_S = 5.0
+#: A helper that ends before it has opened its models is followed by another one after a pause (s), then a longer one.
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
 #: First word of a message from a helper.
 _READY, _STAGE, _RESULT, _FAULT, _UNKNOWN = "ready", "stage", "result", "fault", "unknown"
 _SPAWN = get_context("spawn")
@@ -74,15 +77,22 @@ class _Seat:
 
 
 class Processes:
-    """The `Compute` of this process and of helpers; as many calls at a time as it has seats, the others wait."""
+    """The `Compute` of this process and of helpers; as many calls at a time as it has seats, the others wait.
 
-    def __init__(self, helpers: int, open_models: OpenModels) -> None:
+    Args:
+        helpers: how many.
+        open_models: opens a helper's models.
+        log: where the loss of a helper is told; nowhere when None.
+    """
+
+    def __init__(self, helpers: int, open_models: OpenModels, log: Log | None = None) -> None:
         self._open_models = open_models
+        self._log = log
         self._seats: PriorityQueue[_Seat] = PriorityQueue()
         self._seats.put(_Seat(0))
         self._helpers: set[_Helper] = set()
         self._lock = threading.Lock()
-        self._closed = False
+        self._closed = threading.Event()
         for rank in range(1, helpers + 1):
             self._begin(rank)
 
@@ -109,7 +119,8 @@ class Processes:
             if seat.helper is None or seat.helper.alive:
                 self._seats.put(seat)
             else:
-                self._replace(seat.rank, seat.helper)
+                self._lose(seat.rank, seat.helper)
+                self._begin(seat.rank)
 
     def free(self) -> int:
         """How many more calls could compute now."""
@@ -118,35 +129,56 @@ class Processes:
     def close(self) -> None:
         """End the helpers."""
         with self._lock:
-            self._closed, helpers = True, tuple(self._helpers)
+            self._closed.set()
+            helpers = tuple(self._helpers)
         for helper in helpers:
             helper.close()
 
-    def _replace(self, rank: int, lost: "_Helper") -> None:
-        with self._lock:
-            self._helpers.discard(lost)
-        lost.close()
-        self._begin(rank)
-
     def _begin(self, rank: int) -> None:
         """Start a helper; it gets its seat once it has opened its models."""
-        with self._lock:
-            if self._closed:
+        helper = self._started(rank)
+        threading.Thread(target=self._seat, args=(rank, helper), name=f"helper-{rank}", daemon=True).start()
+
+    def _seat(self, rank: int, helper: "_Helper | None") -> None:
+        """Wait for a helper; for another one, after ever longer pauses, if it ends before it has opened its models."""
+        pause_s = FIRST_PAUSE_S
+        while helper is None or not helper.is_ready():
+            if helper is not None:
+                self._lose(rank, helper)
+            if self._closed.wait(pause_s):
                 return
-            helper = _Helper(self._open_models)
+            helper, pause_s = self._started(rank), min(2 * pause_s, LONGEST_PAUSE_S)
+        self._seats.put(_Seat(rank, helper))
+
+    def _started(self, rank: int) -> "_Helper | None":
+        """A new helper; none when all are to end, or the system has no room for another process."""
+        with self._lock:
+            if self._closed.is_set():
+                return None
+            try:
+                helper = _Helper(self._open_models)
+            except OSError as fault:
+                self._tell("helper cannot be started", rank, exc_info=fault)
+                return None
             self._helpers.add(helper)
+            return helper
 
-        def seat() -> None:
-            if helper.is_ready():
-                self._seats.put(_Seat(rank, helper))
+    def _lose(self, rank: int, lost: "_Helper") -> None:
+        with self._lock:
+            self._helpers.discard(lost)
+        status = lost.close()
+        if not self._closed.is_set():
+            self._tell("helper ended and is started again", rank, status=status, exc_info=lost.fault)
 
-        threading.Thread(target=seat, name=f"helper-{rank}", daemon=True).start()
+    def _tell(self, event: str, rank: int, **more: object) -> None:
+        if self._log is not None:
+            self._log.warning(event, helper=rank, **more)
 
 
 @contextmanager
-def spread(helpers: int, open_models: OpenModels) -> Iterator[Processes]:
+def spread(helpers: int, open_models: OpenModels, log: Log | None = None) -> Iterator[Processes]:
     """Processes while the context lasts."""
-    processes = Processes(helpers, open_models)
+    processes = Processes(helpers, open_models, log)
     try:
         yield processes
     finally:
@@ -171,11 +203,15 @@ class _Helper:
         there.close()
         self._opening, self._opened = threading.Lock(), False
         self.alive = True
+        #: What it met while it opened its models, where it could still tell.
+        self.fault: Exception | None = None
 
     def is_ready(self) -> bool:
         """Wait until its models are open; False when it ended before."""
         with self._opening, suppress(EOFError, OSError):
-            self._opened = bool(self._connection.recv() == (_READY,))
+            kind, *content = self._connection.recv()
+            self._opened = kind == _READY
+            self.fault = None if self._opened else _unpacked(*content)
         return self._opened
 
     def call(
@@ -216,8 +252,8 @@ class _Helper:
             self.alive = False
             raise HelperLost("The process that computed the answer ended; send the request again.") from None
 
-    def close(self) -> None:
-        """End it."""
+    def close(self) -> int | None:
+        """End it; its exit status."""
         self.alive = False
         self._unwanted.value = 1
         if not self._opened:
@@ -228,6 +264,7 @@ class _Helper:
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
+        return self._process.exitcode
 
 
 def _packed(fault: Exception) -> tuple[type[Exception], tuple[Any, ...], dict[str, Any]]:
@@ -248,23 +285,31 @@ def _help(connection: Connection, unwanted: Any, open_models: OpenModels) -> Non
     for number in (signal.SIGINT, signal.SIGTERM):  # who holds the other end decides
         signal.signal(number, signal.SIG_IGN)
     threadpool_limits(limits=1, user_api="blas")
-    models = open_models()
+    with suppress(EOFError, OSError):
+        try:
+            models = open_models()
+        except Exception as fault:  # noqa: BLE001 - it is told where the helper was asked for
+            connection.send((_FAULT, *_packed(fault)))
+            return
+        connection.send((_READY,))
+        while True:
+            _answer(connection, unwanted, models)
+
+
+def _answer(connection: Connection, unwanted: Any, models: Models) -> None:
+    """Answer one call."""
+    work, digest, arguments = connection.recv()
 
     def check() -> None:
         if unwanted.value:
             raise Abandoned("The answer is not wanted any more.")
 
-    with suppress(EOFError, OSError):
-        connection.send((_READY,))
-        while True:
-            work, digest, arguments = connection.recv()
-            model = models.of_digest(digest) or (models.of_digest(digest) if models.refresh() else None)
-            if model is None:
-                connection.send((_UNKNOWN,))
-                continue
-            try:
-                result = work(model, *arguments, watch=lambda stage: connection.send((_STAGE, stage)), check=check)
-            except Exception as fault:  # noqa: BLE001 - it is raised where the work was asked for
-                connection.send((_FAULT, *_packed(fault)))
-            else:
-                connection.send((_RESULT, result))
+    try:
+        model = models.of_digest(digest) or (models.of_digest(digest) if models.refresh() else None)
+        if model is None:
+            connection.send((_UNKNOWN,))
+        else:
+            result = work(model, *arguments, watch=lambda stage: connection.send((_STAGE, stage)), check=check)
+            connection.send((_RESULT, result))
+    except Exception as fault:  # noqa: BLE001 - it is raised where the work was asked for
+        connection.send((_FAULT, *_packed(fault)))

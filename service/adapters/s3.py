@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from typing import BinaryIO
 from urllib.parse import urlsplit
 
 import boto3
+from boto3.exceptions import Boto3Error
 from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 
@@ -40,10 +41,11 @@ class S3Blobs:
         with _as_os_errors():
             self._client.put_object(Bucket=self._bucket, Key=self._prefix + key, Body=data)
 
-    def put_file(self, key: str, path: Path) -> None:
-        """Write a copy of a file, in several pieces when it is large."""
+    def put_file(self, key: str, file: BinaryIO) -> None:
+        """Write a copy of an open file from its beginning, in several pieces when it is large; closes the file."""
+        file.seek(0)
         with _as_os_errors():
-            self._client.upload_file(str(path), self._bucket, self._prefix + key)
+            self._client.upload_fileobj(file, self._bucket, self._prefix + key)
 
     def get(self, key: str) -> bytes:
         """Content of an object; `FileNotFoundError` when it is not there."""
@@ -93,5 +95,5 @@ def _as_os_errors() -> Iterator[None]:
         if error.response.get("Error", {}).get("Code") in _MISSING:
             raise FileNotFoundError("The object is not there.") from None
         raise OSError("The object storage refused the request.") from error
-    except BotoCoreError as error:
+    except (BotoCoreError, Boto3Error) as error:
         raise OSError("The object storage does not answer.") from error

@@ -6,13 +6,13 @@ from service.adapters.image_guard import ImageLimits
 from service.adapters.pacs.archives import open_archive
 from service.adapters.pacs.configuration import load_configuration
 from service.adapters.pacs.delivery import Desk
-from service.app import program_version
 from service.job_ports import BlobStore, JobKind
 from service.jobs.drawings import DrawingTools, drawing_kind
 from service.observability import Log
 from service.pacs import audit_trail, silence_libraries, title_of
 from service.ports import Catalogue
 from service.settings import Settings
+from service.wiring import program_version
 
 
 def pacs_kinds(settings: Settings, file: Path, registry: Catalogue, blobs: BlobStore, log: Log) -> tuple[JobKind, ...]:

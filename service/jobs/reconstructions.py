@@ -1,5 +1,6 @@
 """Reconstruction in the background: one object from its stacks, or every mask of a ZIP or a folder."""
 
+import io
 import json
 
 from model.errors import InputError, InvalidParameter
@@ -50,7 +51,8 @@ def reconstructions_kind(tools: JobTools) -> JobKind:
 def _unpack(tools: JobTools, item: Record, check: Check) -> Record:
     """Inputs 1, 2, ... are the masks of the archive that is input 0; one that cannot be unpacked is an item already."""
     files, names = tools.files(item["job"]), []
-    for mask in masks_in(files.input(0, item.get(SUBMISSION, "")), tools.archive_limits):
+    archive = io.BytesIO(files.input(0, item.get(SUBMISSION, "")))
+    for mask in masks_in(archive, tools.archive_limits):
         check()
         names.append(mask.name)
         if mask.problem is None:

@@ -8,17 +8,13 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
-
-from sqlalchemy.exc import DBAPIError
 
 from service.adapters.images import write_nifti
 from service.adapters.jobs.worker import WorkerOptions, running_worker
 from service.adapters.mesh_formats import write_mesh
-from service.app import mask_reader
-from service.errors import Overloaded
 from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobKind
 from service.jobs.kinds import all_kinds
@@ -26,9 +22,10 @@ from service.jobs.priority import stand_back
 from service.jobs.strays import Strays
 from service.jobs.tools import JobTools
 from service.model_registry import ModelRegistry
-from service.observability import Log, make_log
+from service.observability import Log, going_on
 from service.settings import Settings
 from service.stores import jobs_url, open_blobs, open_jobs, open_results, replica_name
+from service.wiring import mask_reader
 
 #: A worker that died is started again after so long (s).
 _RESTART_AFTER_S = 1.0
@@ -57,7 +54,7 @@ def make_tools(settings: Settings, registry: ModelRegistry, log: Log) -> JobTool
     )
 
 
-def run_worker(settings: Settings, registry: ModelRegistry, slot: int, *, attached: bool = False) -> None:
+def run_worker(settings: Settings, registry: ModelRegistry, slot: int, log: Log, *, attached: bool = False) -> None:
     """Work until SIGTERM or SIGINT; attached, also until standard input ends because who held it is gone."""
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -65,15 +62,15 @@ def run_worker(settings: Settings, registry: ModelRegistry, slot: int, *, attach
     if attached:
         threading.Thread(target=_stop_with_input, args=(stop,), daemon=True).start()
     stand_back(settings.job_nice)
-    log = make_log(settings.log_level)
     tools = make_tools(settings, registry, log)
-    jobs = open_jobs(settings)
+    jobs = open_jobs(settings, log)
     strays = Strays(jobs, tools.blobs)
     with running_worker((*all_kinds(tools), *_pacs_kinds(settings, tools)), worker_options(settings, slot), log):
         log.info("worker started", slot=slot)
         while not stop.wait(settings.sweep_interval_s):
             remove_expired(jobs, tools.blobs, strays, settings.result_lifetime_s, log)
-            registry.refresh()
+            with going_on(log, "models cannot be found anew"):
+                registry.refresh()
         _leave_within(_LEAVE_WITHIN_S)
     jobs.close()
     log.info("worker stopped", slot=slot)
@@ -104,24 +101,27 @@ def _stop_with_input(stop: threading.Event) -> None:
 
 def remove_expired(jobs: JobEngine, blobs: BlobStore, strays: Strays, lifetime_s: float, log: Log) -> None:
     """Forget jobs that ended so long ago, with their files, and files that belong to no job."""
-    try:
+    with going_on(log, "expired jobs cannot be removed"):
         for identifier in jobs.ended_before(datetime.now(UTC) - timedelta(seconds=lifetime_s)):
             JobFiles(blobs, identifier).remove()
             jobs.forget(identifier)
+    with going_on(log, "files without a job cannot be removed"):
         strays.sweep()
-    except (OSError, DBAPIError, Overloaded):
-        log.warning("expired jobs cannot be removed")
 
 
 @contextmanager
-def supervised_workers(count: int, log: Log) -> Iterator[None]:
-    """So many worker processes while the context lasts; one that dies is started again under the same name."""
+def supervised_workers(count: int, log: Log) -> Iterator[Callable[[], None]]:
+    """So many worker processes while the context lasts; one that dies is started again under the same name.
+
+    Yields:
+        What tells them to end, for who has more to do before the context ends.
+    """
     stop = threading.Event()
     keepers = [threading.Thread(target=_keep, args=(slot, stop, log), name=f"worker-{slot}") for slot in range(count)]
     for keeper in keepers:
         keeper.start()
     try:
-        yield
+        yield stop.set
     finally:
         stop.set()
         for keeper in keepers:

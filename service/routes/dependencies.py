@@ -1,7 +1,8 @@
 """What routes are given: the wired parts of the application, and a place among the work."""
 
+import threading
 from collections.abc import AsyncIterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Path, Request
@@ -29,7 +30,11 @@ from service.settings import Settings
 
 @dataclass(frozen=True)
 class Services:
-    """Everything that a route may use; `create_app` puts it together."""
+    """Everything that a route may use; `create_app` puts it together.
+
+    Attributes:
+        closing: set once the server begins to shut down; streams without an end of their own end then.
+    """
 
     settings: Settings
     registry: ModelRegistry
@@ -45,6 +50,7 @@ class Services:
     blobs: BlobStore
     metrics: Metrics
     log: Log
+    closing: threading.Event = field(default_factory=threading.Event)
 
 
 def services_of(request: Request) -> Services:

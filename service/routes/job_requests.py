@@ -1,7 +1,7 @@
 """How requests become jobs: idempotency, a bound on their number, and the answer 202."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, BinaryIO
 
 from fastapi import Header, Request
 from starlette.responses import JSONResponse, Response
@@ -14,7 +14,6 @@ from service.model_registry import pinned_name
 from service.routes.dependencies import Services, address
 from service.routes.negotiation import listed
 
-T = TypeVar("T")
 JOBS_PATH = "/v1/jobs"
 
 _KEY: dict[str, Any] = {"alias": "Idempotency-Key", "min_length": 1, "max_length": 255}
@@ -59,11 +58,11 @@ def submittable_model(services: Services, name: str | None) -> str:
 
 
 def submit(
-    services: Services, kind: str, argument: Mapping[str, Any], inputs: Sequence[bytes], key: str | None
+    services: Services, kind: str, asked: Mapping[str, Any], inputs: Sequence[BinaryIO], key: str | None, model: str
 ) -> JobStatus:
-    """Make a job; errors as of `JobDesk.submit`."""
+    """Make a job; arguments and errors as of `JobDesk.submit`."""
     desk = JobDesk(services.jobs, services.blobs, services.settings.max_jobs)
-    return desk.submit(kind, argument, inputs, key)
+    return desk.submit(kind, asked, inputs, key, model=model)
 
 
 def accepted_job(request: Request, status: JobStatus) -> Response:

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Iterator
-from contextlib import suppress
+from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Path, Request
@@ -11,7 +11,7 @@ from zipstream import ZipStream  # type: ignore[import-untyped]
 
 from model.inference.surface import require_step
 from service import use_cases
-from service.errors import Cancelled, NotReady, Overloaded
+from service.errors import Cancelled, NotReady, Overloaded, UnknownJob, UnknownResult
 from service.job_files import JobFiles, remove_job
 from service.job_ports import JobState, JobStatus
 from service.job_presentation import job_summary
@@ -34,6 +34,8 @@ from service.routes.strict import StrictRoute
 
 #: How often (s) a job is looked at for its events, and how often a silent line is sent so that proxies stay.
 _EVENT_POLL_S, _EVENT_SILENCE_S = 0.5, 15.0
+#: What is said of a job whose result was deleted or has expired before it.
+RESULT_GONE = "The job's result has expired or been deleted."
 _EVENTS = {"description": "server-sent events", "content": {"text/event-stream": {"schema": {"type": "string"}}}}
 
 Identifier = Annotated[str, Path(alias="id", description="identifier of the job", json_schema_extra={"format": "uuid"})]
@@ -98,22 +100,29 @@ async def create_job(
     key: IdempotencyKey = None,
 ) -> Response:
     """Answers at once; the work is done by other processes and goes on after a restart."""
-    return accepted_job(request, await services.turns.run(_submitted, services, form, key))
+    return accepted_job(request, await services.turns.run(_submitted, services, form, key, limit_s=None))
 
 
 def _submitted(services: Services, form: JobForm, key: str | None) -> JobStatus:
-    argument = form.argument(submittable_model(services, form.model))
-    _require_feasible(services, form.kind, argument)
-    inputs = [] if form.archive is None else [form.archive.file.read()]
+    model, asked = submittable_model(services, form.model), form.argument()
+    _require_feasible(services, form.kind, asked, model)
+    inputs = [] if form.archive is None else [form.archive.file]
     for archive in inputs:
         require_archive(archive, parse_annotated(form.annotated), services.settings.archive_limits)
-    return submit(services, form.kind, argument, inputs, key)
+    return submit(services, form.kind, asked, inputs, key, model)
 
 
 async def read_job(identifier: Identifier, request: Request, services: WithServices) -> JobSummary:
     """Items that are made, and the estimated time to the end."""
-    status = await services.turns.run(services.jobs.status, identifier)
+    status = await services.turns.run(_status, services, identifier)
     return job_summary(status, address(request, ""))
+
+
+def _status(services: Services, identifier: str) -> JobStatus:
+    """What is known of a job; one whose result is kept by itself, and is gone, says so."""
+    status = services.jobs.status(identifier)
+    is_kept = status.kind != RECONSTRUCTION_JOB or status.state is not JobState.DONE or services.store.has(identifier)
+    return status if is_kept else replace(status, result=None, problem=RESULT_GONE)
 
 
 async def end_job(identifier: Identifier, request: Request, services: WithServices) -> Response:
@@ -135,17 +144,22 @@ def _ended(services: Services, identifier: str) -> JobStatus | None:
 
 
 async def read_events(identifier: Identifier, request: Request, services: WithServices) -> Response:
-    """An event `progress` with the job's summary at each change, then one called `end`."""
-    first = await services.turns.run(services.jobs.status, identifier)
+    """An event `progress` with the job's summary at each change, then one called `end`.
+
+    A stream without an `end` was ended by the service, which shuts down; ask again.
+    """
+    first = await services.turns.run(_status, services, identifier)
     stream = _events(services, first, address(request, ""))
     return StreamingResponse(stream, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 
 
 async def read_result(identifier: Identifier, request: Request, services: WithServices) -> Response:
     """A ZIP that streams while it is read; the same items as of single requests."""
-    status = await services.turns.run(services.jobs.status, identifier)
+    status = await services.turns.run(_status, services, identifier)
     if status.state is JobState.CANCELLED:
         raise Cancelled("The job was cancelled, so it has no result.")
+    if status.state is JobState.DONE and status.problem == RESULT_GONE:
+        raise UnknownResult(RESULT_GONE)
     if status.state is not JobState.DONE or status.result is None:
         why = f" {status.problem}" if status.problem else ""
         raise NotReady(f"The job has no result: its state is {status.state.value}.{why}")
@@ -157,7 +171,7 @@ async def read_result(identifier: Identifier, request: Request, services: WithSe
 
 async def _events(services: Services, status: JobStatus, prefix: str) -> AsyncIterator[str]:
     told, silent_s = None, 0.0
-    while True:
+    while not services.closing.is_set():
         now = (status.state, status.done, status.total)
         if now != told:
             told, silent_s = now, 0.0
@@ -170,8 +184,17 @@ async def _events(services: Services, status: JobStatus, prefix: str) -> AsyncIt
             yield ":\n\n"
         await asyncio.sleep(_EVENT_POLL_S)
         silent_s += _EVENT_POLL_S
-        with suppress(Overloaded):  # the database is away; the next look may find it
-            status = await services.turns.run(services.jobs.status, status.id)
+        status = await _looked_at(services, status)
+
+
+async def _looked_at(services: Services, status: JobStatus) -> JobStatus:
+    """A job as it is now; one that was deleted has been cancelled for good."""
+    try:
+        return await services.turns.run(services.jobs.status, status.id)
+    except Overloaded:  # the database is away; the next look may find it
+        return status
+    except UnknownJob:
+        return replace(status, state=JobState.CANCELLED, problem="The job was deleted.")
 
 
 def _zip(job: JobFiles, kind: str, count: int) -> Iterator[bytes]:
@@ -182,9 +205,9 @@ def _zip(job: JobFiles, kind: str, count: int) -> Iterator[bytes]:
     yield from archive.finalize()
 
 
-def _require_feasible(services: Services, kind: str, argument: dict[str, Any]) -> None:
+def _require_feasible(services: Services, kind: str, asked: dict[str, Any], model: str) -> None:
     limits = services.settings
     if kind == SAMPLES_JOB:
-        use_cases.batch_seeds(argument["seed"], argument["count"], limits.max_job_samples)
+        use_cases.batch_seeds(asked["seed"], asked["count"], limits.max_job_samples)
     step = "spacing_mm" if kind == SAMPLES_JOB else "resolution_mm"
-    require_step(services.registry.get(argument["model"]), argument[step], limits.max_voxels, part=step)
+    require_step(services.registry.get(model), asked[step], limits.max_voxels, part=step)

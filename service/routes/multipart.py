@@ -6,7 +6,8 @@ from starlette.datastructures import FormData
 from starlette.requests import ClientDisconnect
 from starlette.types import Message
 
-from service.errors import Abandoned, UnsupportedMediaType
+from service.errors import Abandoned, StoreFull, UnsupportedMediaType
+from service.full_disks import is_full
 from service.routes.problems import MalformedBody
 
 MEDIA_TYPE = b"multipart/form-data"
@@ -20,9 +21,10 @@ def with_whole_body(request: Request) -> Request:
     """The same request, whose body has to be whole.
 
     Raises:
-        UnsupportedMediaType: the body is of another kind.
+        UnsupportedMediaType: the body is of another kind, or compressed.
         MalformedBody: while the body is read, when it ends before its last boundary.
     """
+    require_plain(request)
     media, options = parse_options_header(request.headers.get("content-type", ""))
     if media != MEDIA_TYPE:
         raise UnsupportedMediaType("The request's body must be multipart/form-data; the interface names its parts.")
@@ -30,16 +32,27 @@ def with_whole_body(request: Request) -> Request:
     return request if boundary is None else Request(request.scope, _Whole(request, boundary).receive)
 
 
+def require_plain(request: Request) -> None:
+    """Refuse a body that is compressed as a whole: `UnsupportedMediaType`."""
+    if request.headers.get("content-encoding", "identity").strip().lower() not in ("", "identity"):
+        raise UnsupportedMediaType("The request's body must be sent as it is, without the header Content-Encoding.")
+
+
 async def read_form(request: Request) -> FormData:
     """The parts of a body; the request keeps them for whoever asks again.
 
     Raises:
         Abandoned: the client went away first.
+        StoreFull: the disk of temporary files has no room for the body.
     """
     try:
         return await request.form()
     except ClientDisconnect:
         raise Abandoned("The client went away before its request was read.") from None
+    except OSError as fault:
+        if is_full(fault):
+            raise StoreFull("The disk has no room for what was sent; send the request again later.") from fault
+        raise
 
 
 class _Whole:

@@ -28,7 +28,7 @@ def planes_router() -> APIRouter:
         read_planes,
         methods=["POST"],
         summary="The annotated planes of masks",
-        responses=problems(400, 413, 415, 422, 503),
+        responses=problems(400, 413, 415, 422, 503, 507),
     )
     return router
 

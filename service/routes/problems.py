@@ -22,7 +22,8 @@ PROBLEM_MEDIA_TYPE = "application/problem+json"
 METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 #: Sentences for what the HTTP layer finds by itself; its own may repeat what the client sent.
 PROTOCOL_SENTENCES = {
-    400: "The request's body cannot be parsed; send multipart/form-data with a boundary.",
+    400: "The request's body cannot be parsed: Content-Type must name a boundary, the body must begin with it on a "
+    "line of its own, and the headers of each part must be short and name the part.",
     404: "Nothing stands at this address; the interface is described at /docs.",
     405: "The method is not allowed here; the header Allow names those that are.",
     500: "The service met a fault of its own; its logs hold more under the request id.",

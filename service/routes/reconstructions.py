@@ -95,7 +95,7 @@ async def create_reconstruction(
     if len(form.mask) > services.settings.max_masks:
         raise TooLarge(f"At most {services.settings.max_masks} parts named mask are accepted.", part="mask")
     if as_job:
-        return await services.turns.run(_enqueue, request, services, form, key)
+        return await services.turns.run(_enqueue, request, services, form, key, limit_s=None)
     with services.engine.admit() as ticket:
         result = await run_while_connected(request, ticket, partial(_reconstruct, services, form))
     return await run_in_threadpool(_answer, request, services, result, wanted)
@@ -109,9 +109,9 @@ def _enqueue(request: Request, services: Services, form: ReconstructionForm, key
         require_stacks(options.annotated, len(form.mask))
     step, limit = options.resolution_mm, services.settings.max_voxels
     require_step(services.registry.get(model), step, limit, part="resolution_mm")
-    argument = form.model_dump(exclude={"mask", "model"}) | {"model": model, "masks": len(form.mask)}
-    inputs = [mask.file.read() for mask in form.mask]
-    return accepted_job(request, submit(services, RECONSTRUCTION_JOB, argument, inputs, key))
+    asked = form.model_dump(exclude={"mask"}) | {"masks": len(form.mask)}
+    inputs = [mask.file for mask in form.mask]
+    return accepted_job(request, submit(services, RECONSTRUCTION_JOB, asked, inputs, key, model))
 
 
 def _reconstruct(services: Services, form: ReconstructionForm, check: Check) -> StoredResult:

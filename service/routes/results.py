@@ -9,7 +9,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from model.errors import InvalidParameter
-from model.interruption import Check
+from model.interruption import Check, unchecked
 from service import use_cases
 from service.presentation import result_summary
 from service.request_schemas import MeshQuery, UncertaintyQuery, VolumeQuery
@@ -32,7 +32,7 @@ def results_router() -> APIRouter:
         methods=["GET"],
         response_model=ResultSummary,
         summary="Summary of a result",
-        responses=problems(404, 422),
+        responses=problems(404, 422, 503),
     )
     router.add_api_route(
         "",
@@ -40,7 +40,7 @@ def results_router() -> APIRouter:
         methods=["DELETE"],
         status_code=204,
         summary="Forget a result at once",
-        responses={204: {"description": "it is gone"}, **problems(404, 422)},
+        responses={204: {"description": "it is gone"}, **problems(404, 422, 503)},
     )
     router.add_api_route(
         "/mesh",
@@ -98,7 +98,7 @@ async def read_mesh(
         return await run_while_connected(request, ticket, partial(_mesh, services, identifier, query))
 
 
-def _mesh(services: Services, identifier: str, query: MeshQuery, check: Check = use_cases.unchecked) -> Response:
+def _mesh(services: Services, identifier: str, query: MeshQuery, check: Check = unchecked) -> Response:
     result = services.store.load(identifier)
     check()
     data = mesh_bytes(services, result, query.format, query.max_error_mm, query.space)

@@ -11,6 +11,7 @@ from starlette.responses import JSONResponse, Response
 from model.errors import NotFound
 from service.errors import UnsupportedMediaType
 from service.pacs_ports import Disposition, ObjectReceiver, Receipt
+from service.routes.multipart import require_plain
 from service.routes.responses import problems
 
 PATH = "/dicom-web/studies"
@@ -31,6 +32,7 @@ def receiver_of(request: Request) -> ObjectReceiver:
 
 def boundary_of(request: Request) -> bytes:
     """What separates the parts; `UnsupportedMediaType` for other bodies."""
+    require_plain(request)
     media, options = parse_options_header(request.headers.get("content-type", ""))
     kind = options.get(b"type", b"application/dicom").lower()
     boundary = options.get(b"boundary")

@@ -2,14 +2,14 @@
 
 import io
 import json
-import time
 import zipfile
 
 import pytest
 
 from tests.dicom_parts import file_bytes, mr_series, seg_of
 from tests.job_parts import ended, working
-from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, running, sparse_ellipsoid
+from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, problem, running, sparse_ellipsoid
+from tests.waiting import until
 
 JOBS = "/v1/jobs"
 
@@ -155,13 +155,12 @@ def test_a_job_is_forgotten_with_its_result_and_all_that_a_running_part_still_wr
     assert client.get(summary["links"]["result"]).status_code == 404
 
     job = client.post(JOBS, files=form(kind="samples", count=1000, format="npz")).json()
-    while client.get(job["links"]["self"]).json()["state"] == "queued":
-        time.sleep(0.05)
-    time.sleep(0.3)
+    blobs, folder = app.state.services.blobs, f"jobs/{job['id']}/"
+    until(lambda: list(blobs.list(folder)))
     assert client.delete(job["links"]["self"]).json()["state"] == "cancelled"
     assert client.delete(job["links"]["self"]).status_code == 204
     ended(client, client.post(JOBS, files=form(kind="samples", count=2)).headers["location"])  # the worker is free
-    assert list(app.state.services.blobs.list(f"jobs/{job['id']}/")) == []
+    assert list(blobs.list(folder)) == []
 
 
 def test_a_damaged_mask_of_an_archive_is_an_entry_and_stops_no_other(client):
@@ -200,3 +199,21 @@ def test_as_many_jobs_wait_as_may(tmp_path):
         assert refused.status_code == 503
         assert int(refused.headers["retry-after"]) > 0
         assert "morphoflow_jobs_waiting_parts 0.0" in client.get("/metrics").text
+
+
+def test_a_job_whose_result_was_deleted_says_so_and_leads_nowhere(client):
+    accepted = client.post("/v1/reconstructions", files=mask_parts(), headers={"Prefer": "respond-async"})
+    place = accepted.headers["location"]
+    assert client.delete(ended(client, place)["links"]["result"]).status_code == 204
+    summary = client.get(place).json()
+    assert (summary["state"], summary["links"]["result"]) == ("done", None)
+    assert "deleted" in summary["problem"]
+    told = problem(client.get(f"{place}/result", follow_redirects=False), 404)
+    assert (told["type"], told["detail"]) == ("urn:morphoflow:problem:unknown-result", summary["problem"])
+    assert client.delete(place).status_code == 204
+
+
+@pytest.mark.parametrize("name", ["%00", "nothing", "%7Bx%7D"])
+def test_a_name_that_is_no_identifier_is_no_job(client, name):
+    for path in (f"{JOBS}/{name}", f"{JOBS}/{name}/events", f"{JOBS}/{name}/result"):
+        assert problem(client.get(path), 404)["type"].endswith("unknown-job")

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -18,7 +17,7 @@ from service.adapters.pacs.configuration import Archive
 from service.pacs_ports import Disposition
 from tests.dicom_parts import PATIENT_ID, PATIENT_NAME, file_bytes, mr_series, reread, ring, rtstruct_of, seg_of
 from tests.pacs_parts import (
-    PATIENCE_S,
+    Looks,
     by_dicomweb,
     by_get,
     by_move,
@@ -29,6 +28,7 @@ from tests.pacs_parts import (
     service_with,
 )
 from tests.service_parts import sparse_ellipsoid
+from tests.waiting import until
 
 pytestmark = [
     pytest.mark.slow,
@@ -104,9 +104,7 @@ def test_an_archive_that_is_away_is_awaited(orthanc, tmp_path):
     service = service_with(tmp_path, Archive(name="archive", dicomweb=f"http://127.0.0.1:{port}/dicom-web"))
     service.inbox.receive(file_bytes(drawing), "VIEWER")
     with service.working():
-        limit = time.monotonic() + PATIENCE_S
-        while service.said.getvalue().count("archive awaited") < 3 and time.monotonic() < limit:
-            time.sleep(0.05)
+        until(lambda: service.said.getvalue().count("archive awaited") >= 3)
         assert service.inbox.backlog() == 1
         assert service.inbox.quarantined() == 0
         relay = Relay(port, orthanc.http_port)
@@ -163,10 +161,11 @@ def test_images_may_come_after_the_drawing_but_not_for_ever(way, orthanc, tmp_pa
 def test_nothing_is_made_of_half_a_series(way, orthanc, tmp_path):
     images, drawing = drawn_series()
     put_images(orthanc, tmp_path, images[:18])
-    service = service_with(tmp_path, WAYS[way](orthanc))
+    service, looks = service_with(tmp_path, WAYS[way](orthanc)), Looks()
+    service.open_archive = looks.open
     service.inbox.receive(file_bytes(drawing), "VIEWER")
     with service.working():
-        time.sleep(2)
+        until(lambda: looks.count >= 3)  # what the first ones gave has been dealt with
         assert service.inbox.backlog() == 1
         assert results_in(orthanc, images[0].StudyInstanceUID) == []
         put_images(orthanc, tmp_path, images[18:])

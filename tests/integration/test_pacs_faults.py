@@ -2,7 +2,6 @@
 
 import http.server
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -10,22 +9,16 @@ import pytest
 
 from benchmarks.ports import free_ports
 from service.adapters.dicom.results import RESULTS
-from service.adapters.pacs import delivery
 from service.adapters.pacs.commitment import COMMITMENTS
 from service.adapters.pacs.configuration import Archive, Listener
 from service.adapters.pacs.dimse_client import DimseArchive
 from service.adapters.pacs.dimse_server import dimse_listener
 from tests.dicom_parts import file_bytes
 from tests.pacs_archives import TITLE, FakeArchive
-from tests.pacs_parts import Service, drawn_series, service_with, until
+from tests.pacs_parts import Looks, Service, drawn_series, service_with
+from tests.waiting import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("sockets_of_refused_peers")]
-
-
-@pytest.fixture
-def no_prompt_report(monkeypatch) -> None:
-    """No turn waits for a report."""
-    monkeypatch.setattr(delivery, "PROMPT_REPORT_S", 0.0)
 
 
 @contextmanager
@@ -69,14 +62,15 @@ def test_images_that_nobody_refers_to_are_not_left_out_either(tmp_path):
 
 def test_the_time_for_images_does_not_run_while_the_archive_is_away(tmp_path):
     images, drawing = drawn_series()
-    archive = FakeArchive([])
+    archive, looks = FakeArchive([]), Looks()
     service = service_with(tmp_path, archive.settings())
+    service.open_archive = looks.open
     service.configuration = service.configuration.model_copy(update={"images_awaited_s": 2.0})
     service.inbox.receive(file_bytes(drawing), "VIEWER")
     with service.working():
         until(lambda: awaited(service) >= 7)  # 0.1 + 0.2 + 0.4 + 0.5 + 0.5 + 0.5 s
         with archive.running():
-            time.sleep(1)
+            until(lambda: looks.count >= 2)
             archive.images = images
             service.until_empty()
     assert len(archive.stored) == len(RESULTS)
@@ -132,7 +126,6 @@ def test_a_drawing_whose_job_was_cancelled_is_taken_anew(tmp_path):
     assert len(archive.stored) == len(RESULTS)
 
 
-@pytest.mark.usefixtures("no_prompt_report")
 def test_an_archive_may_commit_itself_late(tmp_path):
     images, drawing = drawn_series()
     archive, (port,) = FakeArchive(images), free_ports(1)
@@ -155,7 +148,6 @@ def test_an_archive_may_commit_itself_late(tmp_path):
     assert list(service.blobs.list(f"{COMMITMENTS}/")) == []
 
 
-@pytest.mark.usefixtures("no_prompt_report")
 def test_what_an_archive_lost_is_stored_again_and_asked_for_anew(tmp_path):
     images, drawing = drawn_series()
     archive, (port,) = FakeArchive(images), free_ports(1)
@@ -175,7 +167,6 @@ def test_what_an_archive_lost_is_stored_again_and_asked_for_anew(tmp_path):
     assert len(archive.requests) == 2
 
 
-@pytest.mark.usefixtures("no_prompt_report")
 def test_a_silent_archive_is_asked_again_and_may_answer_either_time(tmp_path):
     images, drawing = drawn_series()
     archive, (port,) = FakeArchive(images), free_ports(1)

@@ -3,11 +3,12 @@
 import gc
 import io
 import shutil
+import socket
 import ssl
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import httpx
@@ -22,10 +23,11 @@ from benchmarks.ports import free_ports
 from service.adapters.dicom.results import RESULTS
 from service.adapters.pacs import sop_classes
 from service.adapters.pacs.commitment import Report, Requests
-from service.adapters.pacs.configuration import Archive, Listener, MoveDestination, Tls
+from service.adapters.pacs.configuration import Listener, MoveDestination, Tls
 from service.adapters.pacs.dimse_client import DimseArchive
 from service.adapters.pacs.dimse_server import dimse_listener
 from service.adapters.pacs.inbox import INBOX, OBJECT
+from service.adapters.pacs.tls import client_context
 from tests.dicom_parts import file_bytes, mr_series
 from tests.pacs_archives import TITLE, FakeArchive
 from tests.pacs_parts import (
@@ -37,9 +39,9 @@ from tests.pacs_parts import (
     replace_archive,
     results_in,
     service_with,
-    until,
 )
 from tests.service_parts import app_for, running
+from tests.waiting import until
 
 pytestmark = [
     pytest.mark.slow,
@@ -74,6 +76,41 @@ def test_only_listed_callers_are_heard(orthanc, tmp_path):
     assert "STRANGER" in (tmp_path / "audit.jsonl").read_text()
 
 
+def test_a_port_with_silent_connections_is_open(tmp_path):
+    service = service_with(tmp_path, FakeArchive([]).settings())
+    (port,) = free_ports(1)
+    with listening(service, Listener(port=port, calling_ae_titles=("VIEWER",))), ExitStack() as silent:
+        for _ in range(20):
+            silent.enter_context(socket.create_connection(("127.0.0.1", port)))
+        peer = associate(port, "VIEWER")
+        assert peer.is_established
+        peer.release()
+
+
+def test_a_port_under_tls_waits_for_no_handshake(tmp_path, certificates):
+    service = service_with(tmp_path, FakeArchive([]).settings())
+    (port,) = free_ports(1)
+    listener = Listener(port=port, calling_ae_titles=("VIEWER",), tls=certificates)
+    with listening(service, listener), socket.create_connection(("127.0.0.1", port)):
+        peer = associate(port, "VIEWER", tls_args=(client_context(certificates), "127.0.0.1"))
+        assert peer.is_established
+        peer.release()
+
+
+def test_one_association_too_many_is_no_alert(tmp_path):
+    service = service_with(tmp_path, FakeArchive([]).settings())
+    (port,) = free_ports(1)
+    listener = Listener(port=port, calling_ae_titles=("VIEWER",), maximum_associations=2)
+    with listening(service, listener):
+        peers = [associate(port, "VIEWER") for _ in range(3)]
+        assert [peer.is_established for peer in peers] == [True, True, False]
+        assert peers[2].is_rejected
+        until(lambda: "association turned away" in service.said.getvalue())
+        for peer in peers[:2]:
+            peer.release()
+    assert not (tmp_path / "audit.jsonl").exists()
+
+
 def test_storescu_is_acknowledged_when_the_object_is_on_disk(orthanc, tmp_path):
     _, drawing = new_study(orthanc, tmp_path)
     service = service_with(tmp_path, by_dicomweb(orthanc))
@@ -103,7 +140,6 @@ def test_storage_commitment_is_asked_for_and_reported(orthanc, ports, tmp_path):
     lost = frozenset({str(unknown[0].SOPInstanceUID)})
     assert reports == {"held": Report(), "unknown": Report(lost), "mixed": Report(lost)}
     assert archive.lacking(images[:2] + unknown) == unknown
-    assert archive.echo()
 
 
 def test_results_go_to_an_archive_that_commits_itself(orthanc, ports, tmp_path):
@@ -132,8 +168,9 @@ def test_associations_over_tls_need_a_certificate(orthanc, tmp_path, certificate
     service = service_with(tmp_path, by_dicomweb(orthanc))
     (port,) = free_ports(1)
     with listening(service, Listener(port=port, calling_ae_titles=("MORPHOFLOW",), tls=certificates)):
-        peer = Archive(name="peer", ae_title="MORPHOFLOW", port=port, tls=certificates)
-        assert DimseArchive(peer).echo()
+        known = associate(port, "MORPHOFLOW", tls_args=(client_context(certificates), "127.0.0.1"))
+        assert known.send_c_echo().Status == 0
+        known.release()
         assert not associate(port, "MORPHOFLOW").is_established
         bare = ssl.create_default_context(cafile=str(certificates.authorities))
         stranger = associate(port, "MORPHOFLOW", tls_args=(bare, "127.0.0.1"))

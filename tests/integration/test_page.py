@@ -14,7 +14,7 @@ from benchmarks.server import serving
 from service.app import create_app
 from service.settings import Settings
 from tests.dicom_parts import file_bytes, mr_series, seg_of
-from tests.page_parts import PHONE, overflow, patient_browser, picture, serious, visiting
+from tests.page_parts import PHONE, overflow, patient_browser, picture, reconstruct, serious, take_example, visiting
 from tests.service_parts import behind_prefix, running
 
 pytestmark = pytest.mark.slow
@@ -38,17 +38,6 @@ def address(shipped_bundles, browser):  # noqa: ARG001 - no service where nobody
 def visit(browser, address):
     with visiting(browser, address) as opened:
         yield opened
-
-
-def take_example(visit):
-    visit.go()
-    visit.page.get_by_role("button", name="Take the example").click()
-    expect(visit.page.get_by_text("3 annotated planes found")).to_be_visible()
-
-
-def reconstruct(visit):
-    visit.page.get_by_role("button", name="Reconstruct", exact=True).click()
-    expect(visit.shown(".figures")).to_be_visible()
 
 
 def volume_of(visit):

@@ -4,13 +4,17 @@ import re
 import sys
 from pathlib import Path
 from subprocess import run
+from urllib.parse import urlsplit
 
 import pytest
 import yaml
 
+from service.routes.middleware import OPEN_PATHS
 from service.settings import Settings
 
 LABELS = {"app.kubernetes.io/name": "morphoflow"}
+#: How long (s) running requests, and workers meanwhile, may take to end.
+REQUESTS_S, LEAVE_WITHIN_S = 30, 30
 
 
 @pytest.fixture(scope="module")
@@ -87,3 +91,40 @@ def test_selectors_find_what_they_name(objects):
 
 def pod(item):
     return item["spec"]["template"]["spec"]
+
+
+def test_a_password_of_the_database_stands_in_no_address(compose):
+    for name in ("service", "worker", "bucket"):
+        environment = compose["services"][name]["environment"]
+        assert urlsplit(environment["MORPHOFLOW_JOBS_DATABASE"]).password is None
+        assert environment["PGPASSWORD"].startswith("${POSTGRES_PASSWORD")
+
+
+def test_prometheus_brings_a_key_to_the_replicas(objects, repository: Path):
+    (scrape,) = yaml.safe_load((repository / "docker" / "prometheus.yaml").read_text())["scrape_configs"]
+    template = objects["Deployment", "service"]["spec"]["template"]
+    labels = template["metadata"]["labels"]
+    ports = [port["name"] for port in template["spec"]["containers"][0]["ports"]]
+    kept = [rule["regex"] for rule in scrape["relabel_configs"] if rule.get("action") == "keep"]
+    assert kept == [labels["app.kubernetes.io/component"], *ports]
+    assert scrape["metrics_path"] not in OPEN_PATHS
+    assert scrape["authorization"]["type"] == "Bearer"
+    assert "annotations" not in template["metadata"]
+
+
+def test_a_queue_that_is_full_for_a_while_takes_no_replica_out(compose, objects):
+    (container,) = pod(objects["Deployment", "service"])["containers"]
+    probe = container["readinessProbe"]
+    assert probe["periodSeconds"] * probe["failureThreshold"] >= 300
+    assert "httpchk GET /healthz" in compose["configs"]["balancer"]["content"]
+
+
+def test_what_is_told_to_stop_has_the_time_that_it_takes(compose, objects, repository: Path):
+    alone = yaml.safe_load((repository / "docker" / "compose.yaml").read_text())["services"]["service"]
+    seconds = {
+        "with workers": int(alone["stop_grace_period"].removesuffix("s")),
+        "service": int(compose["services"]["service"]["stop_grace_period"].removesuffix("s")),
+        "worker": int(compose["services"]["worker"]["stop_grace_period"].removesuffix("s")),
+        "pod": pod(objects["Deployment", "service"])["terminationGracePeriodSeconds"],
+    }
+    assert min(seconds.values()) > max(REQUESTS_S, LEAVE_WITHIN_S)

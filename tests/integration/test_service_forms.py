@@ -1,5 +1,6 @@
 """What a form at fault is told: files and texts that are mixed up, bodies beyond the reader's own limits, labels."""
 
+import gzip
 import io
 import zipfile
 
@@ -91,3 +92,35 @@ def archive(name):
     with zipfile.ZipFile(target, "w") as opened:
         opened.writestr(name, b"1")
     return target.getvalue()
+
+
+def body_of(before=b"", after_boundary=b"", name="m.nii"):
+    head = f'Content-Disposition: form-data; name="mask"; filename="{name}"'.encode()
+    return before + b"--b" + after_boundary + b"\r\n" + head + b"\r\n\r\n1\r\n--b--\r\n"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [body_of(b"preamble\r\n"), body_of(after_boundary=b"  "), body_of(name="n" * 20_000)],
+    ids=["preamble", "padding", "long name"],
+)
+def test_a_body_that_cannot_be_parsed_is_told_what_it_must_be_like(client, body):
+    sent = {"Content-Type": "multipart/form-data; boundary=b"}
+    told = problem(client.post(RECONSTRUCTIONS, content=body, headers=sent), 400)
+    assert told["type"].endswith("malformed-request")
+    assert "missing" not in told["detail"]
+    assert "begin with it" in told["detail"]
+
+
+@pytest.mark.parametrize("path", [RECONSTRUCTIONS, JOBS, "/v1/planes"])
+def test_a_compressed_body_is_told_which_header_is_at_fault(client, path):
+    sent = {"Content-Type": "multipart/form-data; boundary=b", "Content-Encoding": "gzip"}
+    told = problem(client.post(path, content=gzip.compress(body_of()), headers=sent), 415)
+    assert "Content-Encoding" in told["detail"]
+    plain = client.post("/v1/planes", content=body_of(), headers={**sent, "Content-Encoding": "identity"})
+    assert problem(plain, 415)["part"] == "mask[0]"
+
+
+def test_blank_parts_of_a_page_are_left_out(client):
+    blank = {"kind": "samples", "label": "", "archive": "", "mirror": "", "count": "2"}
+    assert client.post(JOBS, files={name: (None, value) for name, value in blank.items()}).status_code == 202

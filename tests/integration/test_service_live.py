@@ -1,9 +1,10 @@
 """The program as people start it: `serve` in a process of its own, and commands on a terminal and in a pipe."""
 
+import json
 import os
 import pty
-import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -58,13 +59,46 @@ def test_serve_answers_prints_a_request_that_works_and_ends_when_told(repository
         made = httpx.post(f"{address}/v1/reconstructions", files=mask_parts(), timeout=60.0)
         assert made.status_code == 201
         process.send_signal(signal.SIGTERM)
-        told = process.communicate(timeout=60.0)[1]
-    assert process.returncode in (0, -signal.SIGTERM)
-    assert '"event": "stopped"' in told
-    (request,) = re.findall(r"curl .*", told)
-    assert address in request
-    assert '"event": "request"' in told
-    assert "Traceback" not in told
+        entries = [json.loads(line) for line in process.communicate(timeout=120.0)[1].splitlines()]
+    assert process.returncode == 0
+    events = [entry["event"] for entry in entries]
+    assert {"started", "request", "stopped"} <= set(events)
+    (example,) = [entry["request"] for entry in entries if entry["event"] == "example"]
+    assert example.startswith("curl ")
+    assert address in example
+
+
+def read_until(stream, event):
+    """Pass over the entries of a log up to this one."""
+    for line in stream:
+        if json.loads(line)["event"] == event:
+            return
+    raise AssertionError(f"the log ended without {event}")
+
+
+def test_workers_leave_when_the_server_is_told_to_and_not_when_its_last_request_has_ended(repository, tmp_path):
+    with serving(repository, tmp_path / "results", MORPHOFLOW_SHIPPED_MODELS="false") as (process, address):
+        read_until(process.stderr, "worker started")
+        host, _, port = address.removeprefix("http://").partition(":")
+        with socket.create_connection((host, int(port))) as slow:
+            slow.sendall(b"POST /v1/planes HTTP/1.1\r\nHost: x\r\nContent-Type: multipart/form-data; boundary=b\r\n")
+            slow.sendall(b"Content-Length: 1000\r\nExpect: 100-continue\r\n\r\n")
+            assert slow.recv(100).startswith(b"HTTP/1.1 100")
+            process.send_signal(signal.SIGTERM)
+            read_until(process.stderr, "worker stopped")
+            assert process.poll() is None
+        read_until(process.stderr, "stopped")
+        assert process.wait(timeout=60.0) == 0
+
+
+def test_an_address_with_a_slash_too_many_leads_to_the_right_one_on_whatever_server_the_client_asked(tmp_path):
+    with running(app_for(tmp_path)) as client:
+        answer = client.get("/v1/models/?a=b", headers={"Host": "evil.example.org"})
+        assert (answer.status_code, answer.headers["location"]) == (307, "/v1/models?a=b")
+        assert client.get("/v1/models/", follow_redirects=True).json() == client.get("/v1/models").json()
+        assert client.get(f"{client.base_url}//evil.example.org/").status_code == 404
+    with running(app_for(tmp_path), root_path="/shape") as client:
+        assert client.get("/v1/models/").headers["location"] == "/shape/v1/models"
 
 
 def test_results_are_there_after_a_crash(repository, tmp_path):

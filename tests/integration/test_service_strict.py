@@ -5,7 +5,6 @@ import pytest
 from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, problem, running
 
 RECONSTRUCTIONS, PLANES, JOBS = "/v1/reconstructions", "/v1/planes", "/v1/jobs"
-FAST = {"uncertainty": "none"}
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """The named cohorts and where their masks lie."""
 
+import os
 from enum import StrEnum
 from pathlib import Path
 
@@ -7,6 +8,9 @@ from model.errors import CohortError
 from training.cohorts import adrenal, femur, hippocampus, talus, vertebra
 from training.cohorts.assemble import CohortOptions
 from training.cohorts.cohort import Cohort
+
+#: Names the data folder where no option does.
+DATA_VARIABLE = "MORPHOFLOW_DATA"
 
 
 class CohortName(StrEnum):
@@ -39,12 +43,16 @@ def load_cohort(name: CohortName, root: Path, options: CohortOptions) -> Cohort:
 
 
 def data_folder(named: Path | None) -> Path:
-    """The data folder that was named, or ``../shared/data`` beside the working folder.
+    """The data folder that was named, or that of the environment (`DATA_VARIABLE`).
 
     Raises:
-        CohortError: there is none.
+        CohortError: none is named, or it is not there.
     """
-    folder = named if named is not None else Path("../shared/data")
-    if not folder.is_dir():
-        raise CohortError("The data folder does not exist; name one with --data or MORPHOFLOW_DATA.")
-    return folder
+    found = named or os.environ.get(DATA_VARIABLE)
+    if not found:
+        raise CohortError(
+            f"Public cohorts are read from a data folder, and none is named; name one with --data or {DATA_VARIABLE}."
+        )
+    if not Path(found).is_dir():
+        raise CohortError(f"The data folder does not exist; name one that does with --data or {DATA_VARIABLE}.")
+    return Path(found)

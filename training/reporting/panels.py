@@ -11,7 +11,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from model.bundle import ShapeModel
-from model.inference.reconstruction import Options, reconstruct
+from model.inference.reconstruction import SURFACE_SD, Options, reconstruct
 from model.inference.sampling import draw_shape
 from model.inference.surface import canonical_box, covering_grid
 from model.inference.uncertainty import occupancy, voxel_entropy
@@ -112,7 +112,7 @@ def uncertainty(model: ShapeModel, case: Case, regime: Regime) -> bytes:
     answer = reconstruct(model, [drawing.stack], options)
     figure = Figure(figsize=(11.0, 3.0), layout="constrained")
     surface = Surface(answer.mesh.vertices, np.asarray(answer.mesh.faces, np.int64))
-    spread = answer.mesh.scalars["surface_sd_mm"]
+    spread = answer.mesh.scalars[SURFACE_SD]
     scale = Normalize(0.0, float(np.quantile(spread, 0.98)))
     axes = axes_around(figure, (1, 4, 1), surface.vertices)
     show(axes, surface, colormaps["magma"](scale(spread[surface.faces].mean(axis=1)))[:, :3])

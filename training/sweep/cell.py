@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from model.bundle import Manifest, ShapeModel, open_bundle, read_manifest
+from model.bundle import MANIFEST, Manifest, ShapeModel, open_bundle, read_manifest
 from model.errors import InvalidParameter
+from training.autodecoder import CHECKPOINT
 from training.calibration import PRECISIONS, calibrate_bundle, calibrate_bundle_as
-from training.choices import DeviceName, ObjectiveName, RegimeName
+from training.choices import DeviceName, ObjectiveName, RegimeName, TrainingChoice
 from training.cohorts.cohort import Case, Cohort
 from training.config import Regime, TrainingConfig
 from training.configuring import configured_for
@@ -23,7 +24,7 @@ from training.prior_choice import chosen_parts
 from training.pruning import PriorParts
 from training.release import UNCALIBRATED_PRECISION, active_dimensions, export_run
 from training.report import FIGURES
-from training.runs import CHECKPOINT, Run, is_finished, prepare
+from training.runs import Run, is_finished, prepare
 from training.seen import check_unseen
 from training.sparsify import for_evaluation
 from training.sweep.plan import Cell, cell_of
@@ -98,7 +99,7 @@ class Place:
 
 def is_exported(bundle: Path) -> bool:
     """Whether a bundle is there."""
-    return (bundle / "manifest.json").is_file()
+    return (bundle / MANIFEST).is_file()
 
 
 def run_cell(
@@ -148,19 +149,19 @@ def _parts(cell: Cell, place: Place, cohort: Cohort, effort: Effort) -> PriorPar
 
 def config_of(cell: Cell, cohort: Cohort, effort: Effort, device: DeviceName) -> TrainingConfig:
     """The configuration of a cell's training."""
-    return configured_for(
-        cohort,
+    choice = TrainingChoice(
         ObjectiveName(cell.objective),
         RegimeName(cell.regime),
         cell.latent_size,
-        reflect=effort.reflect,
         flow=cell.together and cell.prior.flow,
         ard=cell.together and cell.prior.ard,
+        reflect=effort.reflect,
         steps=effort.steps,
         patience=effort.patience,
         seed=cell.seed,
         device=device,
     )
+    return configured_for(cohort, choice)
 
 
 def result_of(cell: Cell, model: ShapeModel, cohort: Cohort, effort: Effort, seconds: float, watch: Watch) -> Result:
@@ -169,10 +170,7 @@ def result_of(cell: Cell, model: ShapeModel, cohort: Cohort, effort: Effort, sec
     Raises:
         InvalidParameter: the cohort has no test shapes, or the model was trained on one that is measured.
     """
-    if not cohort.test:
-        raise InvalidParameter(
-            "The cohort has no test shapes; one with a test split, or --test-fraction, is accepted.", part="cohort"
-        )
+    check_test(cohort)
     cases = cohort.test[: effort.cases]
     check_unseen(model.manifest, cases, "test")
     sigmas = relevance(model.manifest)
@@ -197,6 +195,18 @@ def result_of(cell: Cell, model: ShapeModel, cohort: Cohort, effort: Effort, sec
         surface_mm=drawn.surface_mm.round(4).tolist(),
         measured={regime: _measured(model, cases, regime, watch) for regime in cell.measured_in},
     )
+
+
+def check_test(cohort: Cohort) -> None:
+    """Refuse a cohort on which nothing can be measured.
+
+    Raises:
+        InvalidParameter: it has no test shapes.
+    """
+    if not cohort.test:
+        raise InvalidParameter(
+            "The cohort has no test shapes; one with a test split, or --test-fraction, is accepted.", part="cohort"
+        )
 
 
 def steps_of(manifest: Manifest) -> int:

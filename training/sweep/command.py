@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from model.errors import InvalidParameter
 from training.choices import DeviceName, ObjectiveName, RegimeName, resolved
 from training.cohort_options import opened_cohort, takes_cohort
 from training.cohorts import CohortOptions
@@ -59,7 +58,7 @@ def sweep(
     """Train and measure many models side by side, cell by cell; what is there is skipped."""
     with exit_status():
         from training.configuring import check_patience
-        from training.sweep.cell import Effort, Place, adopt, by_cell
+        from training.sweep.cell import Effort, Place, adopt, by_cell, check_test
         from training.sweep.plan import cells_of
         from training.sweep.record import write_record
         from training.sweep.workers import Sweep
@@ -67,35 +66,28 @@ def sweep(
         given = by_cell(bundle or ())
         found = opened_cohort(source, options)
         tell_findings(found)
-        if not found.test:
-            raise InvalidParameter(
-                "The cohort has no test shapes; one with a test split, or --test-fraction, is accepted.", part="cohort"
-            )
+        check_test(found)
         check_patience(found, patience)
         effort = Effort(steps, PATIENCE if patience is None else patience, calibrate, samples, limit)
         if not write_record(output, source, options, effort.settings()):
             warn("the sweep in the output folder is of an earlier version, whose settings are not known")
         for cell, path in given.items():
             adopt(path, Place.of(output, cell))
-        sizes, regimes, priors = latent_size or LATENT_SIZES, regime or REGIMES, prior or PRIORS
-        asked = (
-            []
-            if bundle and not (latent_size or regime or prior)
-            else cells_of(
-                sizes,
-                [one.value for one in regimes],
-                priors,
-                range(options.seed, options.seed + seeds),
-                objective.value,
-            )
+        asked = cells_of(
+            latent_size or LATENT_SIZES,
+            [one.value for one in regime or REGIMES],
+            prior or PRIORS,
+            range(options.seed, options.seed + seeds),
+            objective.value,
         )
-        cells = tuple(dict.fromkeys([*given, *asked]))
+        only_given = given and not (latent_size or regime or prior)
+        cells = tuple(given if only_given else dict.fromkeys([*given, *asked]))
         _run(Sweep(source, options, cells, output, effort, device), jobs, as_json=as_json)
 
 
 def _run(plan: "Sweep", jobs: int | None, *, as_json: bool) -> None:
     from training.sweep.summary import CSV, write_csv
-    from training.sweep.table import read_results
+    from training.sweep.table import TABLE, read_results
     from training.sweep.workers import refusals, unfinished, work, work_together
 
     plan.folder.mkdir(parents=True, exist_ok=True)
@@ -110,7 +102,7 @@ def _run(plan: "Sweep", jobs: int | None, *, as_json: bool) -> None:
             go(plan, lambda words, done, total: bar.update(task, description=words, completed=done, total=total))
     else:
         _watch_workers(plan, jobs or len(os.sched_getaffinity(0)))
-    results = read_results(plan.folder) if (plan.folder / "results.jsonl").is_file() else []
+    results = read_results(plan.folder) if (plan.folder / TABLE).is_file() else []
     write_csv(results, plan.folder / CSV)
     _tell(plan, refusals(plan), len(unfinished(plan)), as_json=as_json)
 

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from model.errors import MorphoFlowError
-from training.runs import Run, Watch, is_finished
+from training.autodecoder import Watch
+from training.runs import Run, is_finished
 from training.sweep.cell import TRAININGS, Place, config_of, prepared
 from training.sweep.plan import Cell, by_training
 from training.sweep.workers import Cohorts, Sweep, held

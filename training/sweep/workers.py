@@ -49,14 +49,29 @@ class Sweep:
 
 def start_workers(sweep: Sweep, jobs: int) -> list[BaseProcess]:
     """Start processes of one thread; they end when no cell is left."""
-    os.environ.update(OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
     context = multiprocessing.get_context("spawn")
     workers: list[BaseProcess] = [
         context.Process(target=work_for, args=(sweep, os.getpid()), daemon=True) for _ in range(jobs)
     ]
-    for worker in workers:
-        worker.start()
+    with _environment(OMP_NUM_THREADS="1", MKL_NUM_THREADS="1"):
+        for worker in workers:
+            worker.start()
     return workers
+
+
+@contextmanager
+def _environment(**variables: str) -> Iterator[None]:
+    """Variables of the processes that are started inside: what they compute with reads them when it is loaded."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def work_for(sweep: Sweep, parent: int) -> None:

@@ -17,8 +17,8 @@ from pydicom.sr.coding import Code
 from pydicom.uid import UID
 
 from model.bundle import Manifest
+from service.adapters.dicom.masks import label_names
 from service.adapters.dicom.series import Series
-from service.adapters.image_guard import LPS_TO_RAS
 from service.ports import Outcome
 
 MANUFACTURER = "MorphoFlow"
@@ -30,6 +30,10 @@ DISCLAIMER = f"derived, {PURPOSE}"
 SERIES_NUMBERS = {"segmentation": 9001, "maps": 9002, "report": 9003, "model": 9004}
 #: How far the surface may leave the outermost voxels' centres before the segmentation counts as cut (voxels).
 CUT_MARGIN = 0.5
+#: Characters of a segment's label (VR LO).
+LONGEST_LABEL = 64
+#: Largest number of a segment or region that a description has room for.
+LARGEST_DESCRIBED = 999
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class Derivation:
         anatomy: what it is of.
         key: the same for the same drawing, model and settings; decides all identifiers.
         version: of this program.
+        labels: numbers of the drawing's segments or regions that it was made of; all of them when None.
     """
 
     drawing: Dataset
@@ -51,6 +56,7 @@ class Derivation:
     anatomy: Code
     key: str
     version: str
+    labels: frozenset[int] | None = None
 
     def uid(self, name: str) -> UID:
         """Identifier of one object or series of the results."""
@@ -62,6 +68,21 @@ class Derivation:
         return f"{self.outcome.model_name} {self.outcome.model_version}"
 
     @property
+    def structure(self) -> tuple[int, str] | None:
+        """Number and name of the segment or region that it was made of; None for all that the drawing has."""
+        names = label_names(self.drawing, "drawing")
+        if self.labels is None or len(self.labels) > 1 or len(names) < 2:
+            return None
+        (number,) = self.labels
+        return number, names.get(number, "")
+
+    @property
+    def label(self) -> str:
+        """What the structure is called: as it was drawn where the drawing has several, else as the model is."""
+        _, name = self.structure or (0, "")
+        return name[:LONGEST_LABEL] or self.outcome.model_name
+
+    @property
     def is_cut(self) -> bool:
         """Whether the surface reaches beyond the images, so that a segmentation on their frames lacks a part."""
         grid = self.series.grid
@@ -70,6 +91,8 @@ class Derivation:
 
     def description(self, what: str) -> str:
         """What an object holds, whether that is cut, and what it is not for; 64 characters at most (VR LO)."""
+        number, _ = self.structure or (0, "")
+        what += f" #{number}" if 0 < number <= LARGEST_DESCRIBED else ""
         return f"{what}, CUT at border ({PURPOSE})" if self.is_cut else f"{what} ({DISCLAIMER})"
 
     def equipment(self) -> dict[str, Any]:
@@ -122,11 +145,6 @@ def anatomy_of(manifest: Manifest) -> Code:
 def frames_on(series: Series, volume: Float[np.ndarray, "i j k"]) -> Float[np.ndarray, "k j i"]:
     """A volume on the grid of the series as frames of rows and columns, in the order of its images."""
     return np.ascontiguousarray(np.moveaxis(volume, (0, 1, 2), (2, 1, 0))[list(series.order)])
-
-
-def patient_points(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """World RAS mm to patient coordinates (LPS mm), and back."""
-    return np.asarray(points @ LPS_TO_RAS[:3, :3])
 
 
 def references(derivation: Derivation) -> list[Dataset]:

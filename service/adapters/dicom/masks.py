@@ -14,8 +14,8 @@ from model.inference.mask_stack import MaskStack
 from model.inference.stacks import checked_labels
 from service.adapters.dicom.objects import read_object, tolerant
 from service.adapters.dicom.planes import ImageGrid
-from service.adapters.dicom.segmentations import SEGMENTATIONS, read_segmentation
-from service.adapters.dicom.structure_sets import frame_of_regions, images_of_regions, read_structure_set
+from service.adapters.dicom.segmentations import SEGMENTATIONS, drawn_segments, read_segmentation
+from service.adapters.dicom.structure_sets import drawn_regions, frame_of_regions, images_of_regions, read_structure_set
 from service.adapters.image_guard import ImageLimits
 
 #: SOP classes of drawings that are read.
@@ -61,6 +61,25 @@ def stacks_of_object(
     return tuple(replace(stack, space="LPS") for stack in read(found, part, limits, labels, home))
 
 
+def drawn_labels(found: Dataset, part: str) -> frozenset[int]:
+    """Numbers of the segments or regions that draw something; of label maps, all but the background.
+
+    Raises:
+        UnreadableImage: damaged.
+    """
+    with tolerant(part):
+        is_structures = found.SOPClassUID == RTStructureSetStorage
+    return drawn_regions(found, part) if is_structures else drawn_segments(found, part)
+
+
+def label_names(found: Dataset, part: str) -> dict[int, str]:
+    """Names of the segments or regions by number; empty where they have none."""
+    with tolerant(part):
+        if found.SOPClassUID == RTStructureSetStorage:
+            return {int(item.ROINumber): str(item.get("ROIName") or "") for item in found.StructureSetROISequence}
+        return {int(item.SegmentNumber): str(item.get("SegmentLabel") or "") for item in found.SegmentSequence}
+
+
 def frame_of_reference(found: Dataset, part: str, labels: frozenset[int] | None = None) -> str:
     """UID of the frame of reference that the chosen segments or regions are drawn in; empty when the object says none.
 
@@ -84,11 +103,12 @@ def _require_frame(frame: str, part: str, home: Grid | None) -> None:
 
 @dataclass(frozen=True)
 class _Reference:
-    """A series that a drawing refers to: its UID, its frame of reference where said, its images."""
+    """A series that a drawing refers to: its UID, its images, its frame of reference and its study where said."""
 
     series: UID
-    frame: str
     images: tuple[str, ...]
+    frame: str = ""
+    study: str = ""
 
 
 def referenced_series(found: Dataset, labels: frozenset[int] | None = None) -> UID:
@@ -106,7 +126,7 @@ def referenced_series(found: Dataset, labels: frozenset[int] | None = None) -> U
     """
     with tolerant("object"):
         is_structures = found.SOPClassUID == RTStructureSetStorage
-        references = list(_of_structures(found) if is_structures else _of_segmentation(found))
+        references = list(_references(found))
         if not references:
             raise InvalidMask(
                 "The object refers to no series of images; a drawing on images is accepted.", part="object"
@@ -119,21 +139,41 @@ def referenced_series(found: Dataset, labels: frozenset[int] | None = None) -> U
         return best.series
 
 
+def referenced_studies(found: Dataset, series: str) -> tuple[str, ...]:
+    """Study Instance UIDs that a series may be in: the drawing's own, then those that it names for the series.
+
+    Raises:
+        UnreadableImage: damaged.
+    """
+    with tolerant("object"):
+        named = [reference.study for reference in _references(found) if reference.series == series and reference.study]
+        return tuple(dict.fromkeys([str(found.StudyInstanceUID), *named]))
+
+
+def _references(found: Dataset) -> Iterator[_Reference]:
+    is_structures = found.SOPClassUID == RTStructureSetStorage
+    yield from _of_structures(found) if is_structures else _of_segmentation(found)
+
+
 def _of_structures(found: Dataset) -> Iterator[_Reference]:
     for frame in found.get("ReferencedFrameOfReferenceSequence") or []:
         for study in frame.get("RTReferencedStudySequence") or []:
             for series in study.get("RTReferencedSeriesSequence") or []:
-                yield _reference(series, str(frame.get("FrameOfReferenceUID") or ""), "ContourImageSequence")
+                named = _reference(series, "ContourImageSequence", str(study.get("ReferencedSOPInstanceUID") or ""))
+                yield replace(named, frame=str(frame.get("FrameOfReferenceUID") or ""))
 
 
 def _of_segmentation(found: Dataset) -> Iterator[_Reference]:
     for series in found.get("ReferencedSeriesSequence") or []:
-        yield _reference(series, "", "ReferencedInstanceSequence")
+        yield _reference(series, "ReferencedInstanceSequence")
+    for study in found.get("StudiesContainingOtherReferencedInstancesSequence") or []:
+        for series in study.get("ReferencedSeriesSequence") or []:
+            yield _reference(series, "ReferencedInstanceSequence", str(study.StudyInstanceUID))
 
 
-def _reference(series: Dataset, frame: str, name: str) -> _Reference:
+def _reference(series: Dataset, name: str, study: str = "") -> _Reference:
     images = tuple(str(image.ReferencedSOPInstanceUID) for image in series.get(name) or [])
-    return _Reference(UID(series.SeriesInstanceUID), frame, images)
+    return _Reference(UID(series.SeriesInstanceUID), images, study=study)
 
 
 def _images_of_frames(found: Dataset) -> Iterator[str]:

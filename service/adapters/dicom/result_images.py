@@ -22,13 +22,13 @@ def segmentation(derivation: Derivation, inside: Bool[np.ndarray, "i j k"]) -> h
     """
     segment = hd.seg.SegmentDescription(
         segment_number=1,
-        segment_label=derivation.outcome.model_name,
+        segment_label=derivation.label,
         segmented_property_category=codes.SCT.AnatomicalStructure,
         segmented_property_type=derivation.anatomy,
         algorithm_type=hd.seg.SegmentAlgorithmTypeValues.SEMIAUTOMATIC,
         algorithm_identification=algorithm(derivation),
         tracking_uid=derivation.uid("tracking"),
-        tracking_id=derivation.outcome.model_name,
+        tracking_id=derivation.label,
     )
     return hd.seg.Segmentation(
         derivation.series.images,
@@ -85,7 +85,7 @@ def _map(
         ],
         content_creator_name=MANUFACTURER,
         content_label=name.upper(),
-        content_description=derivation.description(quantity.meaning),
+        content_description=derivation.description(name.capitalize()),
         series_description=derivation.description("Uncertainty maps"),
         **derivation.equipment(),
         **derivation.place("maps", name, number),

@@ -60,7 +60,7 @@ def _group(
     evaluations += [(LIMITATION, CUT)] if derivation.is_cut else []
     evaluations += [(LIMITATION, WARNED)] if answer.warnings else []
     return hd.sr.VolumetricROIMeasurementsAndQualitativeEvaluations(
-        tracking_identifier=hd.sr.TrackingIdentifier(derivation.uid("tracking"), derivation.outcome.model_name),
+        tracking_identifier=hd.sr.TrackingIdentifier(derivation.uid("tracking"), derivation.label),
         referenced_segment=_segment(derivation, segmentation),
         finding_type=derivation.anatomy,
         finding_sites=[hd.sr.FindingSite(derivation.anatomy)],

@@ -1,14 +1,11 @@
 """The mesh in two objects: Encapsulated STL and Surface Segmentation (PS3.3, A.85.1 and A.57), in LPS mm."""
 
-from datetime import UTC, datetime
-
 import highdicom as hd
 from pydicom import Dataset
 from pydicom.sequence import Sequence
 from pydicom.sr.codedict import codes
 from pydicom.sr.coding import Code
 from pydicom.uid import EncapsulatedSTLStorage, SurfaceSegmentationStorage
-from pydicom.valuerep import DA, TM
 
 from model.inference.mesh import Mesh, transformed
 from service.adapters.dicom.derivation import MANUFACTURER, Derivation, algorithm, references
@@ -66,20 +63,28 @@ def _object(derivation: Derivation, kind: str, modality: str, series: str, name:
     )
     found.copy_patient_and_study_information(image)
     found.FrameOfReferenceUID, found.PositionReferenceIndicator = image.FrameOfReferenceUID, None
-    now = datetime.now(UTC)
-    found.ContentDate, found.ContentTime = DA(now.date()), TM(now.time())
-    found.ReferencedSeriesSequence = Sequence(_series_references(derivation))
+    _refer(found, derivation)
     return found
 
 
-def _series_references(derivation: Derivation) -> list[Dataset]:
-    items = []
+def _refer(found: Dataset, derivation: Derivation) -> None:
+    """The common instance references (C.12.2); a drawing may be kept in another study than its images."""
     drawing, *images = references(derivation)
-    for series, instances in ((derivation.drawing, [drawing]), (derivation.series.images[0], images)):
-        item = Dataset()
-        item.SeriesInstanceUID, item.ReferencedInstanceSequence = series.SeriesInstanceUID, Sequence(instances)
-        items.append(item)
-    return items
+    drawn = _series_reference(derivation.drawing, [drawing])
+    shown = _series_reference(derivation.series.images[0], images)
+    if derivation.drawing.StudyInstanceUID == found.StudyInstanceUID:
+        found.ReferencedSeriesSequence = Sequence([drawn, shown])
+        return
+    found.ReferencedSeriesSequence = Sequence([shown])
+    study = Dataset()
+    study.StudyInstanceUID, study.ReferencedSeriesSequence = derivation.drawing.StudyInstanceUID, Sequence([drawn])
+    found.StudiesContainingOtherReferencedInstancesSequence = Sequence([study])
+
+
+def _series_reference(source: Dataset, instances: list[Dataset]) -> Dataset:
+    item = Dataset()
+    item.SeriesInstanceUID, item.ReferencedInstanceSequence = source.SeriesInstanceUID, Sequence(instances)
+    return item
 
 
 def _surface(mesh: Mesh) -> Dataset:
@@ -104,7 +109,7 @@ def _surface(mesh: Mesh) -> Dataset:
 
 def _segment(derivation: Derivation) -> Dataset:
     segment, surface = Dataset(), Dataset()
-    segment.SegmentNumber, segment.SegmentLabel = 1, derivation.outcome.model_name
+    segment.SegmentNumber, segment.SegmentLabel = 1, derivation.label
     segment.SegmentedPropertyCategoryCodeSequence = _coded(codes.SCT.AnatomicalStructure)
     segment.SegmentedPropertyTypeCodeSequence = _coded(derivation.anatomy)
     segment.SegmentAlgorithmType, segment.SurfaceCount = "SEMIAUTOMATIC", 1

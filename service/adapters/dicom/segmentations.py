@@ -24,6 +24,8 @@ from service.adapters.image_guard import ImageLimits
 SEGMENTATIONS = (SegmentationStorage, UID("1.2.840.10008.5.1.4.1.1.66.7"))
 #: Share of the largest value from which a voxel of a fractional segmentation belongs to the object.
 OCCUPIED = 0.5
+#: Numbers listed in a message, at most.
+LISTED_NUMBERS = 12
 
 
 def read_segmentation(
@@ -66,6 +68,20 @@ def read_segmentation(
     return stacks_of(part, [grid for grid, _ in grids], volumes, framed)
 
 
+def drawn_segments(found: Dataset, part: str) -> frozenset[int]:
+    """Numbers of the segments that have frames; of a label map, all but the background."""
+    with tolerant(part):
+        is_map = found.SegmentationType == "LABELMAP"
+        return _numbers(found) & (_numbers(found) if is_map else frozenset(_segments_of_frames(found)))
+
+
+def listed(numbers: Iterable[int]) -> str:
+    """Numbers for a message, the first of many."""
+    every = sorted(numbers)
+    rest = len(every) - LISTED_NUMBERS
+    return ", ".join(map(str, every[:LISTED_NUMBERS])) + (f" and {rest} more" if rest > 0 else "")
+
+
 def require_room(grids: Iterable[Grid], part: str, limits: ImageLimits) -> None:
     """Refuse stacks that together have more voxels than allowed: `TooLarge`."""
     if sum(float(np.prod([float(n) for n in grid.shape])) for grid in grids) > limits.max_voxels:
@@ -103,14 +119,14 @@ def _drawings(found: Dataset, part: str, labels: frozenset[int] | None) -> Itera
     """Which pixels of each frame are of the object."""
     with tolerant(part):
         kind, most = str(found.SegmentationType), float(found.get("MaximumFractionalValue") or 1)
-        numbers = [int(segment.SegmentNumber) for segment in found.SegmentSequence]
-        segments = [None] * len(numbers) if kind == "LABELMAP" else _segments_of_frames(found)
-        background = int(found.get("PixelPaddingValue") or 0)
-    wanted = {number for number in numbers if number != background or kind != "LABELMAP"}
-    if labels is not None and wanted.isdisjoint(labels):
-        listed = ", ".join(map(str, sorted(wanted)[:12])) or "none"
-        raise InvalidMask(f"{part} has no such segment; segments that are there: {listed}", part=part)
-    wanted &= labels or wanted
+        known = _numbers(found)
+        segments = [] if kind == "LABELMAP" else _segments_of_frames(found)
+    if labels is not None and not labels <= known:
+        raise InvalidMask(
+            f"{part} has no segment {listed(labels - known)}; segments that are there: {listed(known) or 'none'}",
+            part=part,
+        )
+    wanted = known & (labels or known)
     for number, frame in enumerate(frames_of(found, part)):
         if kind == "LABELMAP":
             yield np.isin(frame, sorted(wanted))
@@ -118,6 +134,13 @@ def _drawings(found: Dataset, part: str, labels: frozenset[int] | None) -> Itera
             yield (frame >= OCCUPIED * most) & (segments[number] in wanted)
         else:
             yield (frame != 0) & (segments[number] in wanted)
+
+
+def _numbers(found: Dataset) -> frozenset[int]:
+    """Segment numbers of the object; the background of a label map is none. Call within `tolerant`."""
+    numbers = frozenset(int(segment.SegmentNumber) for segment in found.SegmentSequence)
+    is_map = found.SegmentationType == "LABELMAP"
+    return numbers - {int(found.get("PixelPaddingValue") or 0)} if is_map else numbers
 
 
 def _segments_of_frames(found: Dataset) -> list[int | None]:

@@ -13,7 +13,7 @@ nothing and are passed over, as are regions without a closed contour.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +27,7 @@ from model.inference.mask_stack import MaskStack
 from model.inference.stacks import checked_labels
 from service.adapters.dicom.objects import tolerant
 from service.adapters.dicom.planes import PARALLEL, REGULAR_SHARE, FramePlane, stack_grid
-from service.adapters.dicom.segmentations import require_room, stacks_of
+from service.adapters.dicom.segmentations import listed, require_room, stacks_of
 from service.adapters.image_guard import LPS_TO_RAS, ImageLimits
 
 #: Geometric types that enclose an area; of the second one those of a region and plane take each other away.
@@ -40,8 +40,6 @@ FLATNESS_MM = 0.1
 SAME_DIGITS = 3
 #: Share of a contour's area that one inside it has at least when it is the same, rounded otherwise.
 SAME_AREA = 0.9
-#: Numbers listed in a message, at most.
-LISTED_NUMBERS = 12
 #: Pixels of planes that no image says: this share of the drawing's extent, within the range (mm).
 PIXEL_SHARE, PIXEL_RANGE_MM = 1 / 128, (0.25, 1.0)
 #: Free room around a drawing without an image (mm).
@@ -121,6 +119,12 @@ def closed_contours(found: Dataset, part: str, labels: frozenset[int] | None) ->
     return sorted(contours, key=lambda contour: contour.area, reverse=True)
 
 
+def drawn_regions(found: Dataset, part: str) -> frozenset[int]:
+    """Numbers of the regions that have a closed contour."""
+    with tolerant(part):
+        return frozenset(_drawn_regions(found, part, None))
+
+
 def frame_of_regions(found: Dataset, part: str, labels: frozenset[int] | None = None) -> str:
     """UID of the frame of reference that the chosen regions are drawn in; empty when none says it.
 
@@ -136,9 +140,9 @@ def frame_of_regions(found: Dataset, part: str, labels: frozenset[int] | None = 
             if frame and int(region.ROINumber) in drawn:
                 frames[frame].append(int(region.ROINumber))
     if len(frames) > 1:
-        listed = " and ".join(f"region {_listed(numbers)}" for numbers in frames.values())
+        places = " and ".join(f"region {listed(numbers)}" for numbers in frames.values())
         raise InvalidGeometry(
-            f"{part} draws {listed} in different frames of reference; regions of one frame are accepted", part=part
+            f"{part} draws {places} in different frames of reference; regions of one frame are accepted", part=part
         )
     return next(iter(frames), "")
 
@@ -170,16 +174,10 @@ def _drawn_regions(found: Dataset, part: str, labels: frozenset[int] | None) -> 
             ]
     if labels is not None and not labels <= known:
         raise InvalidMask(
-            f"{part} has no region {_listed(labels - known)}; regions that are there: {_listed(known) or 'none'}",
+            f"{part} has no region {listed(labels - known)}; regions that are there: {listed(known) or 'none'}",
             part=part,
         )
     return {number: items for number, items in drawn.items() if items}
-
-
-def _listed(numbers: Iterable[int]) -> str:
-    every = sorted(numbers)
-    rest = len(every) - LISTED_NUMBERS
-    return ", ".join(map(str, every[:LISTED_NUMBERS])) + (f" and {rest} more" if rest > 0 else "")
 
 
 def _flat(region: int, points: Float[np.ndarray, "n 3"], is_xor: bool, part: str) -> Contour:

@@ -1,15 +1,17 @@
 """Jobs as their callers see them: kept in a database, done by workers in other processes (`worker`)."""
 
+import sqlite3
 import threading
 import uuid
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import sqlalchemy as sa
-from dbos import DBOSClient, WorkflowStatus, WorkflowStatusString, error
-from sqlalchemy.exc import DBAPIError
+from dbos import DBOSClient, EnqueueOptions, WorkflowStatus, WorkflowStatusString, error
+from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as SQLAlchemyTimeout
 
 from service.adapters.jobs.database import (
@@ -27,8 +29,11 @@ from service.adapters.jobs.database import (
     prepare,
     queue_of,
 )
-from service.errors import Overloaded, UnknownJob
+from service.errors import Overloaded, StoreFull, UnknownJob
+from service.full_disks import is_full
+from service.identifiers import is_identifier
 from service.job_ports import JobState, JobStatus, Record
+from service.observability import Log, make_log
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -49,23 +54,55 @@ _ASKED_FOR = 500
 _FAULT = "The job met a fault of the service; its logs hold more under the job's identifier."
 
 
-def _answered(method: Callable[P, T]) -> Callable[P, T]:
-    """A database that is away is work that cannot be taken now, not a wait."""
+#: What a database, or the way to it, may raise; the first four say that it is away for now, or has no room.
+_AWAY = (OperationalError, InterfaceError, SQLAlchemyTimeout, sqlite3.OperationalError)
+_FAULTS = (*_AWAY, DBAPIError, sqlite3.Error, error.DBOSException)
+#: How PostgreSQL and SQLite say that a disk is full.
+_FULL = ("53100", "SQLITE_FULL")
+
+
+def _answered(method: Callable[Concatenate["DbosJobs", P], T]) -> Callable[Concatenate["DbosJobs", P], T]:
+    """A database that is away is work that cannot be taken now, not a wait; any other of its faults is a fault."""
 
     @wraps(method)
-    def tried(*arguments: P.args, **named: P.kwargs) -> T:
+    def tried(jobs: "DbosJobs", /, *arguments: P.args, **named: P.kwargs) -> T:
         try:
-            return method(*arguments, **named)
-        except (DBAPIError, SQLAlchemyTimeout, error.DBOSException) as fault:
-            if isinstance(fault, error.DBOSException) and not isinstance(fault.__cause__, DBAPIError):
-                raise
-            raise _away() from fault
+            return method(jobs, *arguments, **named)
+        except _FAULTS as fault:
+            cause = _cause(fault)
+            jobs.log.warning("jobs' database", kind=type(cause).__name__, state=_state(cause))
+            if isinstance(cause, _AWAY):
+                raise _away() from fault
+            raise
 
     return tried
 
 
+def _cause(fault: BaseException) -> BaseException:
+    """The database's own fault where DBOS has wrapped it."""
+    return fault.__cause__ if isinstance(fault, error.DBOSException) and fault.__cause__ else fault
+
+
+def _state(fault: BaseException) -> str | None:
+    """How the database names its fault (SQLSTATE, or SQLite's name); None where it had no time to."""
+    origin = getattr(fault, "orig", None) or fault
+    state: str | None = getattr(origin, "sqlstate", None) or getattr(origin, "sqlite_errorname", None)
+    return state
+
+
 def _away() -> Overloaded:
     return Overloaded("The jobs' database does not answer; send the request again later.")
+
+
+@contextmanager
+def _needing_room() -> Iterator[None]:
+    """What makes a job takes room in the database."""
+    try:
+        yield
+    except (*_FAULTS, OSError) as fault:
+        if _state(_cause(fault)) in _FULL or is_full(fault):
+            raise StoreFull("The jobs' database has no room for the job; send the request again later.") from fault
+        raise
 
 
 class DbosJobs:
@@ -73,9 +110,11 @@ class DbosJobs:
 
     Args:
         url: ``sqlite:////folder/file`` or ``postgresql://user@host/database``.
+        log: where faults of the database go, by kind and state alone; standard error when None.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, log: Log | None = None) -> None:
+        self.log = log or make_log("warning")
         self._url = url
         self._lock = threading.Lock()
         self._engine: sa.Engine | None = None
@@ -88,22 +127,21 @@ class DbosJobs:
     @_answered
     def enqueue(self, kind: str, argument: Record, identifier: str) -> JobStatus:
         """Have a job done; one that is there under the identifier is left as it is."""
-        self._client.enqueue(
-            {
-                "workflow_name": JOB,
-                "queue_name": queue_of(kind),
-                "workflow_id": identifier,
-                "app_version": RECORDS_VERSION,
-            },
-            kind,
-            dict(argument),
-        )
+        asked: EnqueueOptions = {
+            "workflow_name": JOB,
+            "queue_name": queue_of(kind),
+            "workflow_id": identifier,
+            "app_version": RECORDS_VERSION,
+        }
+        with _needing_room():
+            self._client.enqueue(asked, kind, dict(argument))
         return self.status(identifier)
 
     @_answered
     def status(self, identifier: str) -> JobStatus:
         """What is known of a job; `UnknownJob` when there is none."""
-        found = self._client.list_workflows(workflow_ids=[identifier], name=JOB)
+        known = is_identifier(identifier)
+        found = self._client.list_workflows(workflow_ids=[identifier], name=JOB) if known else []
         if not found:
             raise UnknownJob("There is no job of this identifier; it may have expired.")
         progress = self._client.get_event(identifier, PROGRESS, 0) or {}
@@ -162,7 +200,9 @@ class DbosJobs:
 
     def close(self) -> None:
         """Let go of the database."""
-        with self._lock:
+        if not self._lock.acquire(timeout=CONNECT_S):  # another thread connects, and is not answered
+            return
+        try:
             if self._opened is not None:
                 client, leases = self._opened
                 client.destroy()
@@ -170,6 +210,8 @@ class DbosJobs:
             if self._engine is not None:
                 self._engine.dispose()
             self._opened = self._engine = None
+        finally:
+            self._lock.release()
 
     @property
     def _client(self) -> DBOSClient:

@@ -10,8 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psycopg
 import sqlalchemy as sa
 from dbos import DBOS, DBOSPortableJSONSerializer
+from psycopg.pq import TransactionStatus
 from sqlalchemy.engine import make_url
 
 from service.pacs_ports import DRAWING_JOB
@@ -29,8 +31,19 @@ JOB, PART = "job", "part"
 SCHEMA = "dbos"
 #: A connection is there within so long (s), a new one or one that others give back, or the database is away.
 CONNECT_S = 3
-#: What one statement, and a transaction that does nothing, may take on PostgreSQL (ms).
+#: What one statement, and a transaction that does nothing, may take on PostgreSQL (ms); how long its answer is waited
+#: for (s), because a server that is gone bounds nothing.
 _STATEMENT_MS, _IDLE_MS = 10_000, 60_000
+ANSWER_S = 11.0
+#: What libpq is told of connections: how long making one takes, and after how long (s, and ms) a peer that has gone
+#: without a word is noticed.
+_BOUNDS = {
+    "connect_timeout": str(CONNECT_S),
+    "keepalives_idle": "5",
+    "keepalives_interval": "2",
+    "keepalives_count": "3",
+    "tcp_user_timeout": "6000",
+}
 
 _LEASES = sa.Table(
     "morphoflow_leases",
@@ -81,15 +94,28 @@ def is_postgres(url: str) -> bool:
 
 
 def bounded(url: str) -> str:
-    """The address with a bound on how long connecting takes, unless it has one; a server may accept and not answer."""
+    """The address with bounds on how long a network or a server may be silent, less those that it has already."""
     parsed = make_url(url)
-    if not is_postgres(url) or "connect_timeout" in parsed.query:
+    missing = {name: bound for name, bound in _BOUNDS.items() if name not in parsed.query}
+    if not is_postgres(url) or not missing:
         return url
-    return parsed.update_query_dict({"connect_timeout": str(CONNECT_S)}).render_as_string(hide_password=False)
+    return parsed.update_query_dict(missing).render_as_string(hide_password=False)
+
+
+class _Answering(psycopg.Connection[Any]):
+    """A connection that fails, and is closed, when an answer takes longer than `ANSWER_S`."""
+
+    def wait(self, gen: Any, interval: float = 0.1, timeout: float | None = ANSWER_S) -> Any:
+        try:
+            return super().wait(gen, interval, timeout)
+        except psycopg.OperationalError:
+            if self.pgconn.transaction_status == TransactionStatus.ACTIVE:
+                self.close()
+            raise
 
 
 def open_engine(url: str, connections: int = 2) -> sa.Engine:
-    """Connections of this project's own; none is waited for longer than `CONNECT_S`."""
+    """Connections of this project's own; none is waited for longer than `CONNECT_S`, no answer than `ANSWER_S`."""
     if not is_postgres(url):
         return sa.create_engine(url, connect_args={"timeout": 30.0})
     engine = sa.create_engine(
@@ -99,8 +125,13 @@ def open_engine(url: str, connections: int = 2) -> sa.Engine:
         pool_timeout=CONNECT_S,
         pool_pre_ping=True,
     )
+    sa.event.listen(engine, "do_connect", _connect)
     sa.event.listen(engine, "connect", _bound_statements)
     return engine
+
+
+def _connect(_dialect: object, _record: object, arguments: Any, named: Any) -> _Answering:
+    return _Answering.connect(*arguments, **named)
 
 
 def _bound_statements(connection: Any, _record: object) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 #: What stands for the line before the first.
 GENESIS = "0" * 64
@@ -73,8 +73,7 @@ class AuditTrail:
         with os.fdopen(handle, "r+b") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             line = chained(message(entry, datetime.now(UTC)), _last_hash(file))
-            file.seek(0, os.SEEK_END)
-            file.write(line)
+            file.write(b"\n" + line if _is_torn(file) else line)
             file.flush()
             os.fsync(file.fileno())
 
@@ -137,19 +136,28 @@ def _participant(name: str, code: str, meaning: str) -> dict[str, Any]:
     return {"UserID": name, "UserIsRequestor": code == "110153", "RoleIDCode": role}
 
 
-def _last_hash(file: Any) -> str:
-    """Hash of the last whole line; what a killed process left of a line stays in the file and breaks nothing unseen."""
-    size = file.seek(0, os.SEEK_END)
-    if size == 0:
-        return GENESIS
-    span = 1 << 16
+def _is_torn(file: BinaryIO) -> bool:
+    """Whether a killed process left a part of a line at the end, which stays there; the position is the end's then."""
+    if file.seek(0, os.SEEK_END) == 0:
+        return False
+    file.seek(-1, os.SEEK_END)
+    return file.read(1) != b"\n"
+
+
+def _last_hash(file: BinaryIO) -> str:
+    """Hash of the last whole line; of the first line's predecessor where there is none."""
+    size, span = file.seek(0, os.SEEK_END), 1 << 16
     while True:
         file.seek(max(0, size - span))
-        lines = file.read().splitlines()
-        if len(lines) > 1 or span >= size:
-            break
+        found = next(filter(None, map(_hash_of, reversed(file.read().splitlines()))), None)
+        if found is not None or span >= size:
+            return found or GENESIS
         span *= 2
+
+
+def _hash_of(line: bytes) -> str | None:
+    """The hash that a line says it has; None for a part of one."""
     try:
-        return str(json.loads(lines[-1])["hash"])
+        return str(json.loads(line)["hash"])
     except (ValueError, KeyError, TypeError):
-        return GENESIS
+        return None

@@ -37,6 +37,7 @@ class Listener(_Closed):
     host: str = Field("127.0.0.1", description="address to listen on")
     port: Port = Field(11112, description="port to listen on")
     calling_ae_titles: tuple[AeTitle, ...] = Field(min_length=1, description="who may associate")
+    maximum_associations: int = Field(100, ge=1, description="associations at the same time; more are turned away")
     tls: Tls | None = Field(None, description="associations over TLS; both sides show a certificate")
 
 

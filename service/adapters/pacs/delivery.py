@@ -11,19 +11,22 @@ from typing import Any
 
 from pydicom import Dataset, dcmread
 
-from service.adapters.dicom.masks import referenced_series
+from model.errors import InvalidMask
+from service.adapters.dicom.masks import referenced_series, referenced_studies
 from service.adapters.dicom.objects import quiet, read_object
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail
 from service.adapters.pacs.commitment import Report, Requests
 from service.adapters.pacs.configuration import Archive, PacsConfiguration
-from service.adapters.pacs.inbox import IMAGES, INBOX, OBJECT, quarantine
+from service.adapters.pacs.inbox import ARGUMENT, IMAGES, INBOX, OBJECT, quarantine
 from service.adapters.pacs.references import referenced_images
 from service.errors import ArchiveUnavailable
 from service.job_ports import BlobStore
 from service.pacs_ports import PictureArchive, Retrieval
 
-#: Beside a drawing: its results, and how far archives are that commit themselves to them.
-RESULTS, DELIVERIES = "results", "deliveries"
+#: Beside a drawing: its results, how far archives are that commit themselves to them, and when others took them.
+RESULTS, DELIVERIES, TAKEN = "results", "deliveries", "taken"
+#: Wait for an archive to show what it took before it is sent again (s).
+SHOWN_S = 600.0
 #: Wait for a report that comes at once, and between two looks for it (s); later ones are for the turns to come.
 PROMPT_REPORT_S, LOOK_S = 2.0, 0.1
 
@@ -54,11 +57,16 @@ class Desk:
 
         Args:
             labels: segments or regions that the rule chose, which are drawn on these images; all when None.
+
+        Raises:
+            InvalidMask: no images are referred to, or those of another patient.
         """
         drawing, name = self.drawing(identifier), self.configuration.rule(rule).fetch_from
-        study, series = str(drawing.StudyInstanceUID), str(referenced_series(drawing, labels))
+        series = str(referenced_series(drawing, labels))
         with self._opened(name) as archive:
-            found = archive.images(study, series)
+            study, found = _retrieved(archive, referenced_studies(drawing, series), series)
+        if study != drawing.StudyInstanceUID:
+            _require_same_patient(drawing, found.images)
         gap = _gap(referenced_images(drawing, series), found)
         if gap is not None:
             return gap
@@ -89,7 +97,7 @@ class Desk:
             if opened.commits:
                 self._commit(opened, results, self._requests(identifier, archive), archive)
             else:
-                _store(opened, results)
+                self._store(opened, results, f"{INBOX}/{identifier}/{TAKEN}/{_name_of(archive)}.json")
         study = str(results[0].StudyInstanceUID)
         self.audit.write(AuditEntry(AuditEvent.SENT, self.title, archive, study, _uids(results)))
         return [hashlib.sha256(str(found.SOPInstanceUID).encode()).hexdigest() for found in results]
@@ -104,11 +112,42 @@ class Desk:
         """Put a drawing in quarantine under a name."""
         key = f"{INBOX}/{identifier}/{OBJECT}"
         if self.blobs.exists(key):
-            quarantine(self.blobs, name, self.blobs.get(key), reason)
+            quarantine(self.blobs, name, self.blobs.get(key), reason, self._labels(identifier))
         self.forget(identifier)
+
+    def _labels(self, identifier: str) -> list[int] | None:
+        """Numbers of the segments or regions that the job is about; None for all."""
+        try:
+            found: list[int] | None = json.loads(self.blobs.get(f"{INBOX}/{identifier}/{ARGUMENT}"))["labels"]
+        except FileNotFoundError:  # a killed process was about to remove the folder
+            return None
+        return found
+
+    def _store(self, opened: PictureArchive, results: Sequence[Dataset], taken: str) -> None:
+        """Send what a query does not find, and make sure that it finds it then.
+
+        Args:
+            taken: the file that says when the archive took the results.
+
+        Raises:
+            ArchiveUnavailable: it does not show them yet.
+        """
+        lacking = opened.lacking(results)
+        if lacking and not self._was_taken(taken):
+            opened.store(lacking)
+            self.blobs.put(taken, json.dumps(self.now_s()).encode())
+            lacking = opened.lacking(lacking)
+        if lacking:
+            raise ArchiveUnavailable("The archive does not show the results that it took.")
+
+    def _was_taken(self, key: str) -> bool:
+        """Whether the archive took the results not long ago."""
+        return self.blobs.exists(key) and self.now_s() - float(json.loads(self.blobs.get(key))) < SHOWN_S
 
     def _commit(self, opened: PictureArchive, results: Sequence[Dataset], requests: Requests, archive: str) -> None:
         """Have an archive commit itself; asked once for all, and again only when it fails or is silent for long.
+
+        What it was sent is sent again when it reports that it lacks it, not while it is silent.
 
         Raises:
             ArchiveUnavailable: it has not reported yet.
@@ -119,7 +158,9 @@ class Desk:
             requests.end()
             return
         if report is not None or not requests.is_awaited(self.now_s(), patience_s):
-            lost = opened.lacking(results) if report is None else _failed(results, report)
+            lost = _failed(results, report) if report is not None else []
+            if not requests.progress.transactions:
+                lost = opened.lacking(results)
             if lost:
                 opened.store(lost)
             opened.ask_commitment(results, requests.begin())
@@ -130,8 +171,7 @@ class Desk:
         raise ArchiveUnavailable("The archive has not committed itself to the results yet.")
 
     def _requests(self, identifier: str, archive: str) -> Requests:
-        name = hashlib.sha256(archive.encode()).hexdigest()
-        return Requests(self.blobs, f"{INBOX}/{identifier}/{DELIVERIES}/{name}.json")
+        return Requests(self.blobs, f"{INBOX}/{identifier}/{DELIVERIES}/{_name_of(archive)}.json")
 
     @contextmanager
     def _opened(self, name: str) -> Iterator[PictureArchive]:
@@ -142,9 +182,29 @@ class Desk:
             archive.close()
 
 
+def _retrieved(archive: PictureArchive, studies: Sequence[str], series: str) -> tuple[str, Retrieval]:
+    """The first study that the archive has images of the series in, and what came of them."""
+    for study in studies:
+        found = archive.images(study, series)
+        if found.images or found.failed:
+            break
+    return study, found
+
+
+def _require_same_patient(drawing: Dataset, images: Sequence[Dataset]) -> None:
+    patients = {str(found.get("PatientID") or "") for found in (drawing, *images)} - {""}
+    if len(patients) > 1:
+        raise InvalidMask(
+            "The drawing and the images that it refers to are of different patients; those of one are accepted.",
+            part="object",
+        )
+
+
 def _gap(wanted: frozenset[str], found: Retrieval) -> str | None:
     """What is missing of the images; None when all have come."""
     missing = wanted - {str(image.SOPInstanceUID) for image in found.images}
+    if found.fault:
+        return found.fault
     if missing:
         return f"{len(missing)} of the {len(wanted)} images that the drawing refers to are not in the archive."
     if found.failed:
@@ -152,13 +212,9 @@ def _gap(wanted: frozenset[str], found: Retrieval) -> str | None:
     return None if found.images else "The images that the drawing refers to are not in the archive."
 
 
-def _store(opened: PictureArchive, results: Sequence[Dataset]) -> None:
-    """Send what a query does not find, and make sure that it finds it then."""
-    lacking = opened.lacking(results)
-    if lacking:
-        opened.store(lacking)
-        if opened.lacking(lacking):
-            raise ArchiveUnavailable("The archive does not show the results that it took.")
+def _name_of(archive: str) -> str:
+    """Of an archive's files."""
+    return hashlib.sha256(archive.encode()).hexdigest()
 
 
 def _failed(results: Sequence[Dataset], report: Report) -> list[Dataset]:

@@ -14,10 +14,14 @@ from service.adapters.pacs.configuration import Archive
 from service.errors import ArchiveRefused, ArchiveUnavailable
 from service.pacs_ports import Retrieval
 
+JSON = "application/dicom+json"
 #: Answers after which the same request may succeed later.
 _PASSING = (408, 425, 429, 500, 502, 503, 504)
 #: Answers to credentials that have expired or are not known yet; those in the file are read anew each time.
 _UNAUTHORISED = (401, 403)
+#: Failure reasons (PS3.18, I.2.2): there is an instance of that UID already, by PS3.7 and by Azure's DICOM service.
+ALREADY_THERE = {0x0111, 0xB00E}
+OUT_OF_RESOURCES, UNKNOWN_REASON = 0xA700, 0x0110
 
 
 class DicomWebArchive:
@@ -40,11 +44,14 @@ class DicomWebArchive:
             return Retrieval([Dataset.from_json(_without_bulk(item)) for item in found])
 
     def store(self, objects: Sequence[Dataset]) -> None:
-        """Send objects of one study."""
+        """Send objects of one study; those that are there already stay as they are."""
         with _faults(), quiet():
-            answer = self._client.store_instances(objects, study_instance_uid=str(objects[0].StudyInstanceUID))
-        if answer.get("FailedSOPSequence"):
-            raise ArchiveRefused("The archive did not take a result.")
+            reasons = _failures(partial(self._client.store_instances, objects, str(objects[0].StudyInstanceUID)))
+        reasons -= ALREADY_THERE
+        if any(reason & 0xFF00 == OUT_OF_RESOURCES for reason in reasons):
+            raise ArchiveUnavailable("The archive has no room for the results now.")
+        if reasons:
+            raise ArchiveRefused(f"The archive refused a result with reason {max(reasons):04X}.")
 
     def lacking(self, objects: Sequence[Dataset]) -> list[Dataset]:
         """Those of the objects that a query does not find."""
@@ -70,6 +77,7 @@ class _Session(requests.Session):
 
     def __init__(self, archive: Archive) -> None:
         super().__init__()
+        self.headers["Accept"] = f"{JSON}, */*;q=0.5"
         self._timeout_s = archive.timeout_s
         if archive.authorization_file is not None:
             self.headers["Authorization"] = _credentials(archive.authorization_file)
@@ -107,6 +115,27 @@ class _faults:  # noqa: N801 - reads as a statement
             raise ArchiveUnavailable("The archive cannot answer now.") from None
         if isinstance(error, requests.RequestException | OSError):
             raise ArchiveUnavailable("The archive cannot be reached.") from None
+
+
+def _failures(store: Callable[[], Dataset]) -> set[int]:
+    """Reasons that an archive gives for objects that it did not store, with whatever status it lists them."""
+    try:
+        answer = store()
+    except requests.HTTPError as error:
+        answer = _listed(error.response)
+        if not answer.get("FailedSOPSequence"):
+            raise
+    return {int(item.get("FailureReason", UNKNOWN_REASON)) for item in answer.get("FailedSOPSequence") or []}
+
+
+def _listed(response: requests.Response | None) -> Dataset:
+    """The store instances response module of an answer 409 (none was stored); empty where there is none to be read."""
+    if response is None or response.status_code != 409:
+        return Dataset()
+    try:
+        return Dataset.from_json(response.json())
+    except (ValueError, TypeError, KeyError, AttributeError):
+        return Dataset()
 
 
 def _or_nothing(ask: Callable[[], list[dict[str, Any]]]) -> list[dict[str, Any]]:

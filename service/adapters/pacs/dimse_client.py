@@ -6,18 +6,20 @@ from contextlib import contextmanager
 from typing import Any
 
 from pydicom import Dataset
-from pynetdicom import AE, StoragePresentationContexts, build_role, evt
+from pynetdicom import AE, build_role, evt
 
 from service.adapters.dicom.objects import quiet
 from service.adapters.pacs import sop_classes
 from service.adapters.pacs.configuration import Archive, MoveDestination, Tls
+from service.adapters.pacs.moved_images import receiving
 from service.adapters.pacs.prompt_sockets import PROMPT
 from service.adapters.pacs.tls import client_context, server_context
 from service.errors import ArchiveRefused, ArchiveUnavailable
 from service.pacs_ports import Retrieval
 
 PENDING = (0xFF00, 0xFF01)
-SUCCESS, SOME_FAILED, NOT_AUTHORISED = 0x0000, 0xB000, 0x0124
+SUCCESS, SOME_FAILED, NOT_AUTHORISED, DUPLICATE_INSTANCE = 0x0000, 0xB000, 0x0124, 0x0111
+UNKNOWN_DESTINATION = 0xA801
 #: Answers to a request for commitment (PS3.7, C): it has been made already; it may succeed later.
 DUPLICATE_TRANSACTION = 0x0131
 PROCESSING_FAILURE, RESOURCE_LIMITATION = 0x0110, 0x0213
@@ -34,11 +36,6 @@ class DimseArchive:
         """Whether the file asks for storage commitment."""
         return self._archive.commitment
 
-    def echo(self) -> bool:
-        """Whether the archive answers (C-ECHO)."""
-        with self._associated([sop_classes.VERIFICATION]) as peer:
-            return bool(peer.send_c_echo().get("Status", -1) == SUCCESS)
-
     def images(self, study: str, series: str) -> Retrieval:
         """Headers of a series; none when the archive does not have it."""
         query = Dataset()
@@ -46,7 +43,7 @@ class DimseArchive:
         return self._get(query) if self._archive.move is None else self._move(query, self._archive.move)
 
     def store(self, objects: Sequence[Dataset]) -> None:
-        """Send objects."""
+        """Send objects; those that are there already stay as they are."""
         with self._associated(sorted({str(found.SOPClassUID) for found in objects})) as peer, quiet():
             for found in objects:
                 status = peer.send_c_store(found).get("Status")
@@ -54,7 +51,7 @@ class DimseArchive:
                     raise ArchiveUnavailable("The archive ended the association.")
                 if status & 0xFF00 == 0xA700:
                     raise ArchiveUnavailable("The archive has no room for the results now.")
-                if status != SUCCESS and status & 0xF000 != 0xB000:
+                if status not in (SUCCESS, DUPLICATE_INSTANCE) and status & 0xF000 != 0xB000:
                     raise ArchiveRefused(f"The archive refused a result with status {status:04X}.")
 
     def lacking(self, objects: Sequence[Dataset]) -> list[Dataset]:
@@ -87,39 +84,36 @@ class DimseArchive:
 
     def _get(self, query: Dataset) -> Retrieval:
         found: dict[str, Dataset] = {}
+        ending = Dataset()
         handlers = [(evt.EVT_C_STORE, _collect(found, query))]
-        roles = [build_role(uid, scp_role=True) for uid in sop_classes.IMAGES]
-        contexts = [sop_classes.FIND, sop_classes.GET, *sop_classes.IMAGES]
-        failed = 0
-        with self._associated(contexts, roles=roles, handlers=handlers) as peer:
+        classes = self._classes(query) or sop_classes.IMAGES
+        roles = [build_role(uid, scp_role=True) for uid in classes]
+        contexts, images = [sop_classes.FIND, sop_classes.GET], sop_classes.image_contexts(classes)
+        with self._associated(contexts, images=images, roles=roles, handlers=handlers) as peer:
             if self._matches(peer, query):  # archives fail to get what they do not have
-                failed = _failures(peer.send_c_get(query, sop_classes.GET))
-        return Retrieval(list(found.values()), failed)
+                ending = _last(peer.send_c_get(query, sop_classes.GET))
+        return _retrieval(found, ending)
+
+    def _classes(self, query: Dataset) -> list[str]:
+        """SOP classes of the images of a series, as far as a query tells."""
+        wanted = Dataset()
+        wanted.QueryRetrieveLevel, wanted.SOPInstanceUID, wanted.SOPClassUID = "IMAGE", "", ""
+        wanted.StudyInstanceUID, wanted.SeriesInstanceUID = query.StudyInstanceUID, query.SeriesInstanceUID
+        with self._associated([sop_classes.FIND]) as peer, quiet():
+            answers = [answer for _, answer in peer.send_c_find(wanted, sop_classes.FIND) if answer is not None]
+        told = {str(answer.get("SOPClassUID") or "") for answer in answers}
+        return sorted(told & sop_classes.STORAGE)
 
     def _move(self, query: Dataset, target: MoveDestination) -> Retrieval:
         found: dict[str, Dataset] = {}
-        failed = 0
+        ending = Dataset()
         contexts = [sop_classes.FIND, sop_classes.MOVE]
-        with self._receiving(target, _collect(found, query)), self._associated(contexts) as peer:
-            if self._matches(peer, query):
-                failed = _failures(peer.send_c_move(query, target.ae_title, sop_classes.MOVE))
-        return Retrieval(list(found.values()), failed)
-
-    @contextmanager
-    def _receiving(self, target: MoveDestination, handler: Callable[[Any], int]) -> Iterator[None]:
-        """The port that images are moved to is open for the archive, and for it alone."""
-        entity: Any = AE(ae_title=target.ae_title)
-        entity.require_called_aet = True
-        entity.require_calling_aet = [self._archive.ae_title]
-        for context in StoragePresentationContexts:
-            entity.add_supported_context(context.abstract_syntax, list(sop_classes.PROPOSED_SYNTAXES))
         secure = None if self._archive.tls is None else _readable(server_context, self._archive.tls)
-        handlers = [PROMPT, (evt.EVT_C_STORE, handler)]
-        server = entity.start_server((target.host, target.port), block=False, ssl_context=secure, evt_handlers=handlers)
-        try:
-            yield
-        finally:
-            server.shutdown()
+        port = receiving(target, self._archive.ae_title, _collect(found, query), secure)
+        with port, self._associated(contexts) as peer:
+            if self._matches(peer, query):
+                ending = _last(peer.send_c_move(query, target.ae_title, sop_classes.MOVE))
+        return _retrieval(found, ending)
 
     def _finds(self, peer: Any, found: Dataset) -> bool:
         query = Dataset()
@@ -141,6 +135,7 @@ class DimseArchive:
         entity.connection_timeout = self._archive.timeout_s
         for context in contexts:
             entity.add_requested_context(context, list(sop_classes.PROPOSED_SYNTAXES))
+        entity.requested_contexts = [*entity.requested_contexts, *more.get("images", ())]
         options = {"ext_neg": more.get("roles"), "evt_handlers": [PROMPT, *(more.get("handlers") or [])]}
         if self._archive.tls is not None:
             options["tls_args"] = (_readable(client_context, self._archive.tls), self._archive.host)
@@ -185,16 +180,27 @@ def _collect(found: dict[str, Dataset], query: Dataset) -> Callable[[Any], int]:
     return keep
 
 
-def _failures(answers: Iterator[tuple[Dataset, Dataset | None]]) -> int:
-    """Read the answers to the last: how many images the archive could not send.
+def _last(answers: Iterator[tuple[Dataset, Dataset | None]]) -> Dataset:
+    """Read the answers to the last.
 
     Raises:
-        ArchiveUnavailable: it sent none, or ended the association.
+        ArchiveUnavailable: the archive ended the association.
     """
     last = Dataset()
     for status, _ in answers:
         last = status
-    if last.get("Status") not in (SUCCESS, SOME_FAILED):
+    if "Status" not in last:
         raise ArchiveUnavailable("The archive did not send the images.")
-    failed = int(last.get("NumberOfFailedSuboperations") or 0)
-    return max(failed, 1) if last.Status == SOME_FAILED else failed
+    return last
+
+
+def _retrieval(found: dict[str, Dataset], ending: Dataset) -> Retrieval:
+    """What came, and how the archive ended it; without a status it had nothing to send."""
+    status = int(ending.get("Status", SUCCESS))
+    failed = int(ending.get("NumberOfFailedSuboperations") or 0)
+    if status == SUCCESS:
+        return Retrieval(list(found.values()), failed)
+    fault = "" if status == SOME_FAILED else f"The archive could not send the images: status {status:04X}."
+    if status == UNKNOWN_DESTINATION:
+        fault = "The archive does not know the title that images are to be moved to."
+    return Retrieval(list(found.values()), max(failed, 1), fault)

@@ -23,6 +23,10 @@ from service.pacs_ports import Disposition, ObjectReceiver
 
 #: Status of a C-STORE (PS3.4, GG.4-1).
 SUCCESS, CANNOT_UNDERSTAND, OUT_OF_RESOURCES, PROCESSING_FAILURE = 0x0000, 0xC000, 0xA700, 0x0110
+#: Time that a connection has for its request (s); one that says nothing holds no place for longer.
+REQUEST_S = 5.0
+#: Source of a rejection that is about the calling or the called title (PS3.8, 9.3.4).
+TITLES = 0x01
 
 
 @contextmanager
@@ -31,6 +35,7 @@ def dimse_listener(
 ) -> Iterator[None]:
     """Accept associations while the context lasts."""
     entity: Any = AE(ae_title=listener.ae_title)
+    entity.maximum_associations, entity.acse_timeout = listener.maximum_associations, REQUEST_S
     entity.require_called_aet = True
     entity.require_calling_aet = list(listener.calling_ae_titles)
     entity.add_supported_context(sop_classes.VERIFICATION)
@@ -108,7 +113,10 @@ class _Desk:
         return SUCCESS, None
 
     def rejected(self, event: Any) -> None:
-        """An association of somebody who is not on the list."""
+        """An association of somebody who is not on the list, or one too many; the former is an alert."""
+        if event.assoc.acceptor.primitive.result_source != TITLES:
+            self._log.warning("association turned away", reason="as many associations as are accepted are open")
+            return
         caller = event.assoc.requestor.ae_title.strip()
         note = "An association was rejected."
         self._audit.write(

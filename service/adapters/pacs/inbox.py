@@ -20,7 +20,7 @@ from service.adapters.pacs.configuration import Rule
 from service.adapters.pacs.headers import Header, header_of
 from service.adapters.pacs.routing import Match, find_rule
 from service.errors import UnknownJob
-from service.job_ports import BlobStore, JobEngine, JobStatus
+from service.job_ports import BlobStore, JobEngine, JobStatus, Record
 from service.pacs_ports import DRAWING_JOB, Disposition, Receipt
 
 INBOX, QUARANTINE = "dicom/inbox", "dicom/quarantine"
@@ -60,7 +60,8 @@ class Inbox:
         except InputError as error:
             return self._quarantine(data, digest, sender, error)
         if match is not None:
-            self._accept(data, drawing_digest(found, match), match)
+            for labels, name in zip(match.structures, drawing_digests(found, match), strict=True):
+                self._accept(data, name, match.rule, labels)
         return self._taken(Header(*named, is_foreign=match is None), sender, match)
 
     def take_up(self) -> None:
@@ -71,7 +72,7 @@ class Inbox:
                 self.jobs.enqueue(DRAWING_JOB, json.loads(self.blobs.get(key)), identifier)
 
     def backlog(self) -> int:
-        """Objects that are accepted and not given back yet."""
+        """Structures of accepted objects that are not given back yet."""
         return len({key.split("/")[2] for key in self.blobs.list(f"{INBOX}/")})
 
     def quarantined(self) -> int:
@@ -93,7 +94,7 @@ class Inbox:
         self.log.warning("object received", disposition=Disposition.MISPLACED.value)
         return Receipt(Disposition.MISPLACED, *uids)
 
-    def _accept(self, data: bytes, digest: str, match: Match) -> None:
+    def _accept(self, data: bytes, digest: str, rule: Rule, labels: frozenset[int] | None) -> None:
         """On disk first, then the job; what a job is at work on, or has given back the results of, is left to it."""
         drawing = self.jobs.new_id(DRAWING_JOB, digest)
         fruitless: list[str] = []
@@ -104,17 +105,20 @@ class Inbox:
             if not self._is_fruitless(status, drawing):
                 return
             fruitless.append(identifier)
-        labels = None if match.labels is None else sorted(match.labels)
-        rule = match.rule
-        argument = {"object": identifier, "rule": rule.name, "labels": labels, "send_to": list(rule.send_to)}
-        argument["drawing"] = drawing
+        argument: Record = {
+            "object": identifier,
+            "drawing": drawing,
+            "rule": rule.name,
+            "labels": None if labels is None else sorted(labels),
+            "send_to": list(rule.send_to),
+        }
         self.blobs.put(f"{INBOX}/{identifier}/{OBJECT}", data)
         self.blobs.put(f"{INBOX}/{identifier}/{ARGUMENT}", json.dumps(argument).encode())
         self.jobs.enqueue(DRAWING_JOB, argument, identifier)
         self._release(drawing, fruitless)
 
     def _identifiers(self, digest: str) -> Iterator[str]:
-        """Of the first job of a drawing, and of those that follow one without results."""
+        """Of the first job of a drawn structure, and of those that follow one without results."""
         yield self.jobs.new_id(DRAWING_JOB, digest)
         for number in count(2):
             yield self.jobs.new_id(DRAWING_JOB, f"{digest}\n{number}")
@@ -127,7 +131,7 @@ class Inbox:
         return is_aside and not self.blobs.exists(f"{INBOX}/{status.id}/{OBJECT}")
 
     def _release(self, drawing: str, fruitless: Sequence[str]) -> None:
-        """A drawing that was sent again is in quarantine no more, nor in the backlog on account of jobs that failed."""
+        """What was sent again is in quarantine no more, nor in the backlog on account of jobs that failed."""
         for identifier in fruitless:
             self.blobs.delete(f"{INBOX}/{identifier}/")
         if self.blobs.exists(f"{QUARANTINE}/{drawing}/{OBJECT}"):
@@ -150,14 +154,22 @@ class Inbox:
         return Receipt(Disposition.QUARANTINED)
 
 
-def quarantine(blobs: BlobStore, name: str, data: bytes, reason: str) -> None:
-    """Put an object aside with the reason."""
+def quarantine(blobs: BlobStore, name: str, data: bytes, reason: str, labels: Sequence[int] | None = None) -> None:
+    """Put an object aside with the reason, and the numbers of the segments or regions that it is about."""
+    about = {} if labels is None else {"segments": list(labels)}
     blobs.put(f"{QUARANTINE}/{name}/{OBJECT}", data)
-    blobs.put(f"{QUARANTINE}/{name}/{REASON}", json.dumps({"reason": reason}).encode())
+    blobs.put(f"{QUARANTINE}/{name}/{REASON}", json.dumps({"reason": reason, **about}).encode())
 
 
-def drawing_digest(found: Dataset, match: Match) -> str:
-    """The same for the same drawing, whichever way it comes and however often."""
+def drawing_digests(found: Dataset, match: Match) -> list[str]:
+    """One for each structure: the same for the same drawing, whichever way it comes and however often."""
     with tolerant("object"):
         content = found.to_json(bulk_data_threshold=1 << 62, suppress_invalid_tags=True)
-    return hashlib.sha256(f"{match.rule.name}\n{content}".encode()).hexdigest()
+    whole = _digest(f"{match.rule.name}\n{content}")
+    if len(match.structures) == 1:
+        return [whole]
+    return [_digest(f"{whole}\n{sorted(labels or ())}") for labels in match.structures]
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

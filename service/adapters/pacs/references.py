@@ -18,7 +18,7 @@ def referenced_images(found: Dataset, series: str) -> frozenset[str]:
     """
     with tolerant("object"):
         if found.get("SOPClassUID") != RTStructureSetStorage:
-            return _listed(found.get("ReferencedSeriesSequence") or [], "ReferencedInstanceSequence").get(series, _NONE)
+            return _listed(_series_of_segmentation(found), "ReferencedInstanceSequence").get(series, _NONE)
         listed = _listed(_series_of(found), "ContourImageSequence")
         others = frozenset[str]().union(*(images for uid, images in listed.items() if uid != series))
         return listed.get(series, _NONE) | (frozenset(_images_of_contours(found)) - others)
@@ -34,6 +34,11 @@ def _listed(items: Iterable[Dataset], name: str) -> dict[str, frozenset[str]]:
         series = str(item.SeriesInstanceUID)
         listed[series] = listed.get(series, _NONE) | frozenset(_instances(item, name))
     return listed
+
+
+def _series_of_segmentation(found: Dataset) -> Iterator[Dataset]:
+    for study in (found, *(found.get("StudiesContainingOtherReferencedInstancesSequence") or [])):
+        yield from study.get("ReferencedSeriesSequence") or []
 
 
 def _series_of(found: Dataset) -> Iterator[Dataset]:

@@ -7,10 +7,14 @@ from fnmatch import fnmatchcase
 from pydicom import Dataset
 from pydicom.uid import RTStructureSetStorage
 
+from model.errors import InvalidMask
 from service.adapters.dicom.derivation import MANUFACTURER
-from service.adapters.dicom.masks import DRAWINGS
+from service.adapters.dicom.masks import DRAWINGS, drawn_labels, label_names
 from service.adapters.dicom.objects import tolerant
 from service.adapters.pacs.configuration import Rule
+
+#: Structures that one object may hold for a rule; each is reconstructed by itself.
+MOST_STRUCTURES = 32
 
 
 @dataclass(frozen=True)
@@ -24,10 +28,14 @@ class Segment:
 
 @dataclass(frozen=True)
 class Match:
-    """The rule that takes an object, and the numbers of the segments or regions that it means."""
+    """The rule that takes an object, and the structures that it means.
+
+    Attributes:
+        structures: numbers of the segments or regions of each; None for the whole object.
+    """
 
     rule: Rule
-    labels: frozenset[int] | None
+    structures: tuple[frozenset[int] | None, ...]
 
 
 def find_rule(rules: Sequence[Rule], found: Dataset, sender: str) -> Match | None:
@@ -35,6 +43,7 @@ def find_rule(rules: Sequence[Rule], found: Dataset, sender: str) -> Match | Non
 
     Raises:
         UnreadableImage: a header that cannot be read.
+        InvalidMask: more structures than are accepted.
     """
     with tolerant("object"):
         if found.get("SOPClassUID") not in DRAWINGS or found.get("Manufacturer") == MANUFACTURER:
@@ -43,27 +52,42 @@ def find_rule(rules: Sequence[Rule], found: Dataset, sender: str) -> Match | Non
     for rule in rules:
         wanted = [segment for segment in segments if _means(rule, segment)]
         if wanted and _is_from(rule, sender) and _holds(rule.body_parts, body_part):
-            named = bool(rule.segment_codes or rule.segment_labels)
-            return Match(rule, frozenset(segment.number for segment in wanted) if named else None)
+            return Match(rule, _structures(rule, frozenset(segment.number for segment in wanted), found))
     return None
 
 
+def _structures(rule: Rule, wanted: frozenset[int], found: Dataset) -> tuple[frozenset[int] | None, ...]:
+    """Each of several segments or regions by itself, left and right for instance; those that draw nothing do not count.
+
+    Raises:
+        InvalidMask: more than are accepted.
+    """
+    drawn = wanted & drawn_labels(found, "object") if len(wanted) > 1 else wanted
+    if len(drawn) > MOST_STRUCTURES:
+        raise InvalidMask(
+            f"The object has {len(drawn)} segments or regions that the rule takes; {MOST_STRUCTURES} are accepted.",
+            part="object",
+        )
+    if len(drawn) > 1:
+        return tuple(frozenset([number]) for number in sorted(drawn))
+    named = bool(rule.segment_codes or rule.segment_labels)
+    return ((drawn or wanted) if named else None,)
+
+
 def _segments(found: Dataset) -> list[Segment]:
+    names = label_names(found, "object")
     if found.SOPClassUID == RTStructureSetStorage:
         observed = {
             int(item.ReferencedROINumber): _codes(item, "RTROIIdentificationCodeSequence")
             for item in found.get("RTROIObservationsSequence") or []
         }
-        regions = [(int(item.ROINumber), str(item.get("ROIName") or "")) for item in found.StructureSetROISequence]
-        return [Segment(number, name, observed.get(number, frozenset())) for number, name in regions]
-    return [
-        Segment(
-            int(item.SegmentNumber),
-            str(item.get("SegmentLabel") or ""),
-            _codes(item, "SegmentedPropertyTypeCodeSequence") | _codes(item, "AnatomicRegionSequence"),
-        )
-        for item in found.SegmentSequence
-    ]
+    else:
+        observed = {
+            int(item.SegmentNumber): _codes(item, "SegmentedPropertyTypeCodeSequence")
+            | _codes(item, "AnatomicRegionSequence")
+            for item in found.SegmentSequence
+        }
+    return [Segment(number, name, observed.get(number, frozenset())) for number, name in names.items()]
 
 
 def _codes(item: Dataset, name: str) -> frozenset[str]:

@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import pytest
 
 from model.bundle import (
@@ -177,7 +178,7 @@ def test_what_a_manifest_lacks_is_named(bundle, name):
         ("discrepancy", {"spread_mm": 0.6}, "a number for fidelity"),
         ("usual", {"misfit_mm": 0.6, "misfit_exponent": 0.1}, "surface_sd_mm, surface_sd_exponent"),
         ("posterior", {"sd_scale": None, "offset_mm": 0.1}, "sd_scale"),
-        ("typical", {"freedom": 9.0}, "density_mean"),
+        ("typical", {"freedom": 9.0}, "rarity_mean"),
         ("typical", [1.0], "figures by name"),
     ],
 )
@@ -186,15 +187,76 @@ def test_a_value_that_cannot_be_is_named_with_what_is_accepted(bundle, name, val
     assert name in refusal(bundle, BundleCorrupt, naming) or name == "latent_size"
 
 
-def test_a_population_of_another_size_is_refused(bundle):
-    codes = np.zeros((5, 2))
-    np.savez(bundle / "population.npz", codes=codes, base_codes=codes, log_densities=np.zeros(5), volumes_ml=np.ones(5))
+def vouch_for(bundle, name):
+    """Set down the digest that a file has now."""
     files = json.loads((bundle / MANIFEST).read_text())["files"]
-    edit(bundle, files={**files, "population.npz": file_digest(bundle / "population.npz")})
-    refusal(bundle, BundleCorrupt, "latent_size 3")
-    np.savez(bundle / "population.npz", codes=codes, base_codes=codes, log_densities=np.zeros(5))
-    edit(bundle, files={**files, "population.npz": file_digest(bundle / "population.npz")})
-    refusal(bundle, BundleCorrupt, "lacks volumes_ml")
+    edit(bundle, files={**files, name: file_digest(bundle / name)})
+
+
+def with_population(bundle, **changes):
+    codes = np.zeros((5, 3))
+    arrays = {"codes": codes, "base_codes": codes, "log_densities": np.zeros(5), "volumes_ml": np.ones(5), **changes}
+    np.savez(bundle / POPULATION, **{name: values for name, values in arrays.items() if values is not None})
+    vouch_for(bundle, POPULATION)
+
+
+@pytest.mark.parametrize(
+    ("changes", "naming"),
+    [
+        ({"codes": np.zeros((5, 2)), "base_codes": np.zeros((5, 2))}, "latent_size 3"),
+        ({"base_codes": np.zeros((4, 3))}, "latent_size 3"),
+        ({"codes": np.zeros(3), "base_codes": np.zeros(3)}, "latent_size 3"),
+        ({"volumes_ml": None}, "lacks volumes_ml"),
+        ({"log_densities": np.zeros(4)}, "as many log_densities as codes"),
+        ({"volumes_ml": np.float64(1.0)}, "as many volumes_ml as codes"),
+        ({"volumes_ml": np.array(["1"] * 5)}, "floating-point numbers"),
+    ],
+)
+def test_a_population_of_another_size_is_refused(bundle, changes, naming):
+    with_population(bundle, **changes)
+    refusal(bundle, BundleCorrupt, naming)
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", b"PK\x03\x04", "half", "one array", "objects"])
+def test_a_population_that_cannot_be_parsed_is_refused(bundle, content):
+    file = bundle / POPULATION
+    if content == "half":
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    elif content == "one array":
+        with file.open("wb") as stream:
+            np.save(stream, np.zeros((5, 3)))
+    elif content == "objects":
+        np.savez(file, codes=np.array([{}, {}], dtype=object))
+    else:
+        file.write_bytes(content)
+    vouch_for(bundle, POPULATION)
+    refusal(bundle, BundleCorrupt, f"{POPULATION} cannot be parsed")
+
+
+GRAPHS = ("decoder_logits", "decoder_jacobians", "prior_density", "prior_sampling_1")
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", "half", "newer"])
+@pytest.mark.parametrize("name", [f"{graph}.onnx" for graph in (*GRAPHS, "prior_base_jacobian")])
+def test_a_graph_that_cannot_be_opened_is_named(bundle, name, content):
+    file = bundle / name
+    if content == "half":
+        content = file.read_bytes()[: file.stat().st_size // 2]
+    elif content == "newer":
+        graph = onnx.load(file)
+        graph.ir_version = 99
+        content = graph.SerializeToString()
+    file.write_bytes(content)
+    vouch_for(bundle, name)
+    refusal(bundle, BundleCorrupt, name)
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage"])
+@pytest.mark.parametrize("graph", GRAPHS)
+def test_a_torchscript_graph_that_cannot_be_opened_is_refused(bundle, graph, content):
+    (bundle / f"{graph}.pt").write_bytes(content)
+    vouch_for(bundle, f"{graph}.pt")
+    refusal(bundle, BundleCorrupt, ".pt", backend="torchscript")
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,18 @@ from importlib.metadata import EntryPoint
 
 import nibabel as nib
 import numpy as np
+import psycopg
 import pytest
 import trimesh
 import typer
 
+from benchmarks.ports import free_port
 from model.errors import BundleCorrupt
 from service.cli import BAD_INPUT, FAULT, build_app, command_names, example_request, interface_yaml, load_plugins, main
 from service.model_registry import BrokenModel, ModelRegistry
 from service.ports import MeshFormat
 from service.settings import Settings
+from service.stores import missing_database
 from tests.analytic_model import ellipsoid_model
 from tests.dicom_parts import file_bytes, mr_series, seg_of
 from tests.service_parts import NAME, mask_bytes, sparse_ellipsoid
@@ -273,6 +276,42 @@ def test_what_lacks_an_extra_says_how_to_install_it(words, library, setting, ext
     told = capsys.readouterr().err
     assert told.endswith(f"needs the extra {extra}: pip install -c constraints.txt '.[{extra}]'\n")
     assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize("word", ["serve", "worker"])
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("RESULTS_FOLDER", "/proc/absent/results"),
+        ("RESULTS_FOLDER", "/proc/version"),
+        ("RESULT_LIFETIME_S", "inf"),
+        ("JOBS_DATABASE", "mysql://user:hush@host/name"),
+        ("STORAGE_URL", "gs://bucket"),
+    ],
+)
+def test_what_nothing_can_be_kept_in_is_refused_at_the_start(word, setting, value, capsys, monkeypatch):
+    monkeypatch.setenv(f"MORPHOFLOW_{setting}", value)
+    assert run(word) == BAD_INPUT
+    told = capsys.readouterr().err
+    assert setting in told.upper()
+    assert value not in told
+    assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize("word", ["serve", "worker"])
+def test_a_database_that_is_not_there_is_named_and_not_made(word, postgres_url, tmp_path, capsys, monkeypatch):
+    name = "absent_" + postgres_url.rpartition("_")[2]
+    monkeypatch.setenv("MORPHOFLOW_RESULTS_FOLDER", str(tmp_path / "results"))
+    monkeypatch.setenv("MORPHOFLOW_JOBS_DATABASE", f"{postgres_url.rpartition('/')[0]}/{name}")
+    assert run(word) == BAD_INPUT
+    assert f"the database {name}, which is not on its server" in capsys.readouterr().err
+    with psycopg.connect(postgres_url) as connection:
+        assert not connection.execute("SELECT 1 FROM pg_database WHERE datname = %s", [name]).fetchall()
+    assert missing_database(postgres_url) is None
+
+
+def test_a_server_that_does_not_answer_is_not_one_without_the_database():
+    assert missing_database(f"postgresql://user@127.0.0.1:{free_port()}/jobs") is None
 
 
 def test_the_interface_is_written_to_a_file(tmp_path):

@@ -6,7 +6,7 @@ import zipfile
 import pytest
 
 from model.errors import InvalidParameter, TooLarge
-from service.job_archives import ArchiveLimits, masks_in, open_archive
+from service.job_archives import ArchiveLimits, masks_in, open_archive, zip_of_folder
 
 LIMITS = ArchiveLimits(max_masks=10, max_mask_bytes=10_000, max_bytes=25_000)
 MASKS = {"a.nii": b"a" * 5000, "b.nii": b"b" * 5000, "c.nii.gz": b"c"}
@@ -66,7 +66,7 @@ def with_an_unknown_method():
 )
 def test_what_is_no_whole_zip_is_refused(archive):
     with pytest.raises(InvalidParameter) as caught:
-        open_archive(bytes(archive))
+        open_archive(io.BytesIO(archive))
     assert caught.value.part == "archive"
 
 
@@ -83,7 +83,7 @@ def test_what_is_no_whole_zip_is_refused(archive):
     ids=["stream", "checksum", "password", "method", "size", "bzip2"],
 )
 def test_a_member_at_fault_stops_no_other(archive, word):
-    masks = {mask.name: mask for mask in masks_in(bytes(archive), LIMITS)}
+    masks = {mask.name: mask for mask in masks_in(io.BytesIO(archive), LIMITS)}
     assert word in masks["b.nii"].problem
     assert masks["b.nii"].content == b""
     if word != "deflated":
@@ -92,7 +92,7 @@ def test_a_member_at_fault_stops_no_other(archive, word):
 
 def test_masks_come_in_the_order_of_their_names_and_nothing_else_does():
     members = {"z.nii": b"1", "m/a.nrrd": b"2", "m/.b.nii": b"", "__MACOSX/c.nii": b"", "read.me": b"", "m/": b""}
-    assert [(mask.name, mask.content) for mask in masks_in(bytes(packed(members)), LIMITS)] == [
+    assert [(mask.name, mask.content) for mask in masks_in(io.BytesIO(packed(members)), LIMITS)] == [
         ("m/a.nrrd", b"2"),
         ("z.nii", b"1"),
     ]
@@ -103,4 +103,14 @@ def test_masks_that_are_too_many_or_too_large_together_are_refused_before_one_is
     many = bytes(packed({f"{number}.nii": b"" for number in range(11)}))
     for archive, word in ((few, "25000 bytes together"), (many, "10 masks")):
         with pytest.raises(TooLarge, match=word):
-            next(masks_in(archive, LIMITS))
+            next(masks_in(io.BytesIO(archive), LIMITS))
+
+
+def test_the_masks_of_a_folder_are_those_of_its_zip(tmp_path):
+    (tmp_path / "deep").mkdir()
+    for name in ("deep/b.nii", "a.nrrd", "read.me", ".c.nii"):
+        (tmp_path / name).write_bytes(name.encode())
+    target = io.BytesIO()
+    zip_of_folder(tmp_path, target)
+    found = [(mask.name, mask.content) for mask in masks_in(target, LIMITS)]
+    assert found == [("a.nrrd", b"a.nrrd"), ("deep/b.nii", b"deep/b.nii")]

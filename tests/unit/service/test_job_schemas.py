@@ -28,7 +28,7 @@ CHOICES = st.fixed_dictionaries(
 
 @given(CHOICES)
 def test_choices_of_a_job_are_those_of_a_request(choices):
-    argument = JobForm(kind="reconstructions", archive=FILE, format="ply", **choices).argument("model@1")
+    argument = JobForm(kind="reconstructions", archive=FILE, format="ply", **choices).argument()
     assert options_of(argument) == ReconstructionForm(mask=[FILE], **choices).options()
 
 
@@ -42,4 +42,10 @@ def test_a_request_that_becomes_a_job_keeps_its_choices(choices):
 def test_choices_of_reconstructions_are_refused_for_samples(name):
     value = {"fidelity": 0.5, "mirror": "auto", "resolution_mm": 1.0}[name]
     with pytest.raises(InvalidParameter, match=name):
-        JobForm(kind="samples", **{name: value}).argument("model@1")
+        JobForm(kind="samples", **{name: value}).argument()
+
+
+def test_blank_labels_are_none_as_other_blank_parts_are():
+    assert JobForm(kind="samples", label=["", " "]).argument() == JobForm(kind="samples").argument()
+    with pytest.raises(InvalidParameter, match="label"):
+        JobForm(kind="samples", label=["", "1"]).argument()

@@ -1,5 +1,6 @@
 """Requests of one key at the same time: one job, with the inputs of the request that made it."""
 
+import io
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -24,19 +25,31 @@ class MeetingBlobs(FolderBlobs):
         super().__init__(folder)
         self._all = threading.Barrier(writers)
 
-    def put(self, key, data):
+    def put_file(self, key, file):
         with suppress(threading.BrokenBarrierError):
             self._all.wait(20.0)
-        super().put(key, data)
+        super().put_file(key, file)
 
 
 class FullBlobs(FolderBlobs):
     """A disk without room for large files."""
 
-    def put(self, key, data):
-        if len(data) > 10:
+    def put_file(self, key, file):
+        if file.seek(0, io.SEEK_END) > 10:
             raise OSError("The disk is full.")
-        super().put(key, data)
+        super().put_file(key, file)
+
+
+class Upload(io.BytesIO):
+    """A file of which no more than a piece may be in memory."""
+
+    def read(self, size=-1):
+        assert 0 < size <= 1 << 20
+        return super().read(size)
+
+
+def sent(*contents):
+    return tuple(map(io.BytesIO, contents))
 
 
 @pytest.fixture
@@ -54,7 +67,7 @@ def test_requests_of_one_key_at_the_same_time_make_one_job_of_one_of_them(jobs, 
     def submit(number):
         content = b"ab"[number % 2 : number % 2 + 1]
         try:
-            return content, desk.submit(RECONSTRUCTION_JOB, {"masks": 1}, (content,), "one")
+            return content, desk.submit(RECONSTRUCTION_JOB, {"masks": 1}, sent(content), "one", model="m@1")
         except InvalidParameter:
             return content, None
 
@@ -71,9 +84,27 @@ def test_requests_of_one_key_at_the_same_time_make_one_job_of_one_of_them(jobs, 
 
 def test_inputs_that_cannot_be_kept_take_none_of_another_submission(jobs, tmp_path):
     blobs = FullBlobs(tmp_path)
-    mine = JobDesk(jobs, blobs, 64).submit(RECONSTRUCTION_JOB, {"masks": 2}, (b"1", b"2"), "one")
+    mine = JobDesk(jobs, blobs, 64).submit(RECONSTRUCTION_JOB, {"masks": 2}, sent(b"1", b"2"), "one", model="m@1")
     jobs.forget(mine.id)  # as if the other request had looked before this one was enqueued
     with pytest.raises(StoreFull):
-        JobDesk(jobs, blobs, 64).submit(RECONSTRUCTION_JOB, {"masks": 2}, (b"1", b"2" * 100), "one")
+        JobDesk(jobs, blobs, 64).submit(RECONSTRUCTION_JOB, {"masks": 2}, sent(b"1", b"2" * 100), "one", model="m@1")
     assert JobFiles(blobs, mine.id).input(1, mine.argument[SUBMISSION]) == b"2"
     assert len(list(blobs.list("jobs/"))) == 2
+
+
+def test_what_is_sent_is_kept_piece_by_piece(jobs, tmp_path):
+    content = bytes(range(256)) * 20_000
+    made = JobDesk(jobs, FolderBlobs(tmp_path), 64).submit(
+        RECONSTRUCTION_JOB, {"masks": 1}, (Upload(content),), model="m@1"
+    )
+    assert JobFiles(FolderBlobs(tmp_path), made.id).input(0) == content
+
+
+@pytest.mark.parametrize("named", [None, "m"], ids=["no model named", "one without version"])
+def test_a_request_sent_again_after_a_new_version_of_its_model_leads_to_its_job(jobs, tmp_path, named):
+    desk, asked = JobDesk(jobs, FolderBlobs(tmp_path), 64), {"model": named, "masks": 1}
+    first = desk.submit(RECONSTRUCTION_JOB, asked, sent(b"1"), "one", model="m@1")
+    again = desk.submit(RECONSTRUCTION_JOB, asked, sent(b"1"), "one", model="m@2")
+    assert (again.id, again.argument["model"]) == (first.id, "m@1")
+    with pytest.raises(InvalidParameter):
+        desk.submit(RECONSTRUCTION_JOB, {**asked, "model": "m@2"}, sent(b"1"), "one", model="m@2")

@@ -1,5 +1,9 @@
 """One broken model does not stop the others."""
 
+import errno
+import gc
+import shutil
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -121,3 +125,38 @@ def test_a_bundle_is_opened_again_only_when_its_manifest_changes(tmp_path):
     (tmp_path / MANIFEST).write_text("{} ")
     once(tmp_path)
     assert len(opened) == 2
+
+
+def test_a_bundle_that_is_gone_is_forgotten_and_one_that_comes_back_is_opened_again(tmp_path):
+    opened = []
+    once = OpenedOnce(lambda folder: opened.append(folder) or versioned("1.0.0"))
+    (tmp_path / MANIFEST).write_text("{}")
+    once(tmp_path)
+    once.forget_all_but([tmp_path])
+    once(tmp_path)
+    assert len(opened) == 1
+    once.forget_all_but([])
+    once(tmp_path)
+    assert len(opened) == 2
+
+
+def test_a_removed_bundle_takes_no_memory(shipped_bundles, tmp_path):
+    folder = shutil.copytree(shipped_bundles[0], tmp_path / "models" / "bone")
+    registry = load_registry(Settings(shipped_models=False, models=(folder.parent,), threads=1))
+    model = weakref.ref(registry.get(None))
+    assert model() is not None
+    shutil.rmtree(folder)
+    assert registry.refresh()
+    gc.collect()
+    assert model() is None
+
+
+def test_models_are_kept_while_the_program_has_no_more_files_to_open(tmp_path):
+    found = {"x": versioned("1.0.0")}
+    registry = ModelRegistry(
+        {"hip": found["x"]}, reload=lambda: load_models([tmp_path / name for name in found], opener(found))
+    )
+    found["x"] = OSError(errno.EMFILE, "Too many open files")
+    with pytest.raises(OSError, match="Too many"):
+        registry.refresh()
+    assert registry.names() == ("hip",)

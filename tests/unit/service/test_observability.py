@@ -4,12 +4,22 @@ import io
 import json
 import logging
 import logging.config
+import subprocess
+import sys
 import traceback
 
 import pytest
 
 from model.errors import BundleCorrupt, InvalidMask
-from service.observability import MOST_FRAMES, exception_told, make_log, uvicorn_logging
+from service.observability import (
+    MOST_FRAMES,
+    REPEATED_AFTER_S,
+    Seldom,
+    exception_told,
+    going_on,
+    library_logging,
+    make_log,
+)
 
 SECRET = "SMITH^JOHN"
 
@@ -92,7 +102,7 @@ def test_logs_of_the_program_and_of_its_server_tell_the_same():
 
 
 def server_handlers(stream):
-    configured = logging.config.DictConfigurator(uvicorn_logging("info"))
+    configured = logging.config.DictConfigurator(library_logging("info"))
     formatter = configured.configure_formatter(configured.config["formatters"]["json"])
     handler = logging.StreamHandler(stream)
     handler.setFormatter(formatter)
@@ -102,3 +112,67 @@ def server_handlers(stream):
 def test_sentences_of_the_program_are_told():
     error = InvalidMask("The mask holds no foreground.", part="mask[0]")
     assert told(error) == [{"exc_type": "InvalidMask", "frames": [], "exc_value": "The mask holds no foreground."}]
+
+
+PROGRAM = f"""
+import logging, sys, threading, warnings
+from service.observability import log_everything
+
+log = log_everything("info")
+log.info("begun")
+logging.getLogger("uvicorn.error").info("The server speaks.")
+logging.getLogger("uvicorn.error").error("Traceback (most recent call last):\\n  ...\\nValueError: {SECRET}")
+logging.getLogger("asyncio").error("socket.accept() out of system resource\\nsocket: {SECRET}")
+logging.getLogger("reader").warning("%s is odd", "{SECRET}")
+warnings.warn("{SECRET} is odd")
+thread = threading.Thread(target=lambda: open("/absent/{SECRET}"))
+thread.start()
+thread.join()
+raise ValueError("{SECRET}")
+"""
+
+
+def test_all_that_a_program_says_is_an_entry_of_the_log_without_contents(repository):
+    run = subprocess.run(
+        [sys.executable, "-c", PROGRAM], cwd=repository, stderr=subprocess.PIPE, text=True, check=False
+    )
+    entries = [json.loads(line) for line in run.stderr.splitlines()]
+    assert run.returncode == 1
+    assert SECRET not in run.stderr
+    assert [entry["event"] for entry in entries] == [
+        "begun",
+        "The server speaks.",
+        "fault",
+        "socket.accept() out of system resource",
+        "a library has a message",
+        "a library warns",
+        "fault",
+        "fault",
+    ]
+    assert [entry["exception"][0]["exc_type"] for entry in entries[-2:]] == ["FileNotFoundError", "ValueError"]
+
+
+def record(text, at_s, line=1):
+    made = logging.LogRecord("asyncio", logging.ERROR, __file__, line, text, None, None)
+    made.created = at_s
+    return made
+
+
+def test_what_is_said_again_and_again_is_written_now_and_then():
+    seldom = Seldom()
+    times = [0.0, 1.0, REPEATED_AFTER_S - 0.1, REPEATED_AFTER_S, REPEATED_AFTER_S + 1.0]
+    assert [seldom.filter(record("no descriptors\nsocket 3", at)) for at in times] == [True, False, False, True, False]
+    assert seldom.filter(record("something else", times[-1]))
+    assert seldom.filter(record("no descriptors\nsocket 3", times[-1], line=2))
+
+
+def test_what_fails_in_one_turn_is_told_and_the_next_turn_comes():
+    log, turns = io.StringIO(), []
+    for turn in range(3):
+        with going_on(make_log("info", log), "the turn failed"):
+            turns.append(turn)
+            reads_a_folder() if turn == 1 else None
+    (entry,) = map(json.loads, log.getvalue().splitlines())
+    assert turns == [0, 1, 2]
+    assert entry["event"] == "the turn failed"
+    assert entry["exception"][0]["exc_type"] == "ValueError"

@@ -26,6 +26,12 @@ def test_planes_survive_json(chosen):
     assert parse_annotated(text) == tuple(chosen)
 
 
+@given(planes)
+def test_a_plane_without_its_stack_is_of_the_first(chosen):
+    text = json.dumps([{"axis": p.axis, "index": p.index} for p in chosen])
+    assert parse_annotated(text) == tuple(Plane(0, p.axis, p.index) for p in chosen)
+
+
 @given(st.text())
 def test_any_other_text_is_refused_in_a_sentence(text):
     assume(text.strip() not in ("auto", "all", "nonempty"))

@@ -8,6 +8,9 @@ import pytest
 from model.errors import InvalidParameter
 from service.settings import SETTINGS_FILE_VARIABLE, Settings, is_loopback, load_settings, require_protection
 
+#: What no time (s) of the settings may be.
+NO_TIMES = ("-1", "0", "nan", "inf", "-inf", "1e300")
+
 
 @pytest.fixture(autouse=True)
 def bare_environment(monkeypatch):
@@ -51,13 +54,47 @@ def test_lists_in_the_file_are_lists(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("PORT", "0"), ("PORT", "x"), ("MAX_BODY_BYTES", "0"), ("RESULT_LIFETIME_S", "-1"), ("BACKEND", "y")],
+    [
+        ("PORT", "0"),
+        ("PORT", "x"),
+        ("MAX_BODY_BYTES", "0"),
+        ("BACKEND", "y"),
+        *[(name, value) for name in ("RESULT_LIFETIME_S", "SWEEP_INTERVAL_S", "JOB_LEASE_S") for value in NO_TIMES],
+        ("JOBS_DATABASE", "garbage"),
+        ("JOBS_DATABASE", "mysql://user:hush@host/name"),
+        ("JOBS_DATABASE", "postgresql://user:hush@host:port/name"),
+        ("JOBS_DATABASE", "postgresql://user:hush@host"),
+        ("STORAGE_URL", "bucket"),
+        ("STORAGE_URL", "s3://"),
+        ("STORAGE_URL", "https://bucket.example.org"),
+        ("STORAGE_ENDPOINT", "storage:8333"),
+        ("STORAGE_ENDPOINT", "http://storage:port"),
+    ],
 )
 def test_a_value_out_of_range_is_named(monkeypatch, name, value):
     monkeypatch.setenv(f"MORPHOFLOW_{name}", value)
     with pytest.raises(InvalidParameter) as caught:
         load_settings()
     assert name.lower() == caught.value.part
+    assert "hush" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("jobs_database", "postgresql://user:hush@host:5432/name"),
+        ("jobs_database", "postgresql:///name?host=/run/postgresql"),
+        ("jobs_database", "sqlite:////folder/file"),
+        ("storage_url", "s3://bucket"),
+        ("storage_url", "s3://bucket/pre/fix"),
+        ("storage_endpoint", "http://storage:8333"),
+        ("storage_endpoint", "https://[::1]"),
+        ("result_lifetime_s", "3153600000"),
+    ],
+)
+def test_places_and_times_that_can_be_are_accepted(monkeypatch, name, value):
+    monkeypatch.setenv(f"MORPHOFLOW_{name.upper()}", value)
+    assert name in load_settings().model_fields_set
 
 
 @pytest.mark.parametrize("text", ["prot = 1\n", "port = \n"])

@@ -3,14 +3,24 @@
 import pytest
 
 from model.errors import InvalidParameter
-from training.choices import DeviceName, ObjectiveName, RegimeName, configured, with_batches, with_duration
+from training.choices import (
+    DeviceName,
+    ObjectiveName,
+    RegimeName,
+    TrainingChoice,
+    configured,
+    with_batches,
+    with_duration,
+)
 from training.config import TrainingConfig
 
 
+def chosen(objective=ObjectiveName.VARIATIONAL, **more):
+    return TrainingChoice(objective, RegimeName.THICK, 16, seed=3, device=DeviceName.CPU, **more)
+
+
 def built(objective=ObjectiveName.VARIATIONAL, flow=True, ard=True, **more):
-    return configured(
-        objective, RegimeName.THICK, 16, flow=flow, ard=ard, reflected=True, seed=3, device=DeviceName.CPU, **more
-    )
+    return configured(chosen(objective, flow=flow, ard=ard, **more), reflected=True)
 
 
 def test_options_reach_the_configuration():
@@ -30,8 +40,23 @@ def test_the_weight_of_relevance_determination_is_a_choice(objective):
 def test_a_weight_of_relevance_determination_that_does_not_act_is_refused():
     for ard in (False, None):
         with pytest.raises(InvalidParameter, match="--ard-weight would do nothing; it is accepted with --ard"):
-            built(ard=ard, ard_weight=7e-5)
+            chosen(ard=ard, ard_weight=7e-5)
     assert built(ObjectiveName.CENTRED, ard=None, ard_weight=7e-5).objective.lambda_ard == 7e-5
+
+
+def test_steps_and_epochs_exclude_each_other():
+    with pytest.raises(InvalidParameter, match="one of them is accepted") as caught:
+        chosen(steps=10, epochs=2)
+    assert caught.value.part == "epochs"
+
+
+@pytest.mark.parametrize("objective", list(ObjectiveName))
+def test_a_prior_is_trained_along_unless_it_is_fitted_afterwards(objective):
+    together = objective is not ObjectiveName.VARIATIONAL
+    assert (chosen(objective).use_flow, chosen(objective).use_ard) == (together, together)
+    for said in (True, False):
+        assert chosen(objective, flow=said).use_flow is said
+        assert chosen(objective, ard=said).use_ard is said
 
 
 def test_the_paper_is_selectable_as_written():

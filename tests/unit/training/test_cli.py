@@ -101,6 +101,12 @@ class TestTrain:
         assert "\r" not in result.output
         assert len(result.stdout.splitlines()) == 1
 
+    def test_a_folder_without_a_run_is_not_resumed(self, run, masks, tmp_path):
+        result = run("train", "--masks", masks, *SMALL, "--output", tmp_path / "run", "--resume")
+        assert result.exit_code == 2
+        assert "holds no run to resume" in result.stderr
+        assert not (tmp_path / "run").exists()
+
     def test_a_finished_run_is_resumed_without_a_step(self, run, masks, tmp_path):
         words = ("train", "--masks", masks, *SMALL, "--output", tmp_path / "run", "--json")
         assert run(*words).exit_code == 0

@@ -177,5 +177,16 @@ class TestCatalogue:
 
     def test_the_data_folder_must_be_there(self, tmp_path):
         assert data_folder(tmp_path) == tmp_path
-        with pytest.raises(CohortError, match="MORPHOFLOW_DATA"):
+        with pytest.raises(CohortError, match=r"does not exist.*MORPHOFLOW_DATA"):
             data_folder(tmp_path / "none")
+
+    def test_the_data_folder_is_named_by_the_caller_or_the_environment(self, tmp_path, monkeypatch):
+        for folder in ("work", "shared/data", "elsewhere"):
+            (tmp_path / folder).mkdir(parents=True)
+        monkeypatch.chdir(tmp_path / "work")
+        monkeypatch.delenv("MORPHOFLOW_DATA", raising=False)
+        with pytest.raises(CohortError, match="none is named; name one with --data or MORPHOFLOW_DATA"):
+            data_folder(None)
+        monkeypatch.setenv("MORPHOFLOW_DATA", str(tmp_path / "elsewhere"))
+        assert data_folder(None) == tmp_path / "elsewhere"
+        assert data_folder(tmp_path / "shared") == tmp_path / "shared"

@@ -1,7 +1,5 @@
 """Which cohort is meant, from the options of a command."""
 
-from contextlib import contextmanager
-
 import nibabel as nib
 import numpy as np
 import pytest
@@ -9,13 +7,12 @@ import typer
 from typer.testing import CliRunner
 
 from tests.ellipsoid_cohort import GRID, ellipsoids
-from training import cohort_options
-from training.cohort_options import DATA_VARIABLE, opened_cohort, takes_cohort
+from training.cohort_options import opened_cohort, takes_cohort
 from training.cohorts import CohortOptions
+from training.cohorts.catalogue import DATA_VARIABLE
 from training.cohorts.cohort import SideName
 from training.cohorts.sources import CohortSource, LayoutName
 from training.cohorts.voxelising import SpaceName
-from training.console import progress
 
 
 @pytest.fixture
@@ -75,20 +72,16 @@ def test_the_data_folder_of_the_environment_is_no_choice_of_the_caller(asked, tm
     assert asked("--masks", tmp_path, "--data", ".", **environment)[0] is None
 
 
-def test_a_bar_shows_how_far_an_alignment_is(monkeypatch, tmp_path):
+def test_a_bar_shows_how_far_an_alignment_is(monkeypatch, capsys, tmp_path):
+    for name in ("FORCE_COLOR", "TTY_COMPATIBLE"):  # a terminal, to those that ask
+        monkeypatch.setenv(name, "1")
+    monkeypatch.setenv("TERM", "xterm")
     for n, shape in enumerate(ellipsoids(3)):
         nib.save(nib.Nifti1Image(shape.mask(GRID).astype(np.uint8), GRID.affine), tmp_path / f"e{n}.nii.gz")
-    bars = []
-
-    @contextmanager
-    def kept(total, words):
-        with progress(total, words) as bar:
-            bars.append(bar)
-            yield bar
-
-    monkeypatch.setattr(cohort_options, "progress", kept)
     opened_cohort(CohortSource(masks=tmp_path), CohortOptions())
-    assert bars == []
+    assert "aligning shapes" not in capsys.readouterr().err
     assert len(opened_cohort(CohortSource(masks=tmp_path, align=True), CohortOptions()).train) == 2
-    (task,) = bars[0].tasks
-    assert (task.completed, task.total) == (3 * 2 + 1, 3 * 2 + 1)
+    shown = capsys.readouterr().err
+    assert "aligning shapes" in shown
+    whole = 3 * 2 + 1
+    assert f"{whole}/{whole}" in shown

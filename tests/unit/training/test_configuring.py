@@ -3,7 +3,7 @@
 import pytest
 
 from tests.ellipsoid_cohort import GRID, ellipsoids
-from training.choices import DeviceName, ObjectiveName, RegimeName
+from training.choices import DeviceName, ObjectiveName, RegimeName, TrainingChoice
 from training.cohorts import Case, Cohort, Provenance
 from training.cohorts.cohort import NOT_STATED, SideName
 from training.configuring import configured_for
@@ -13,11 +13,9 @@ def reflected(side, **more):
     cases = tuple(Case(f"e{n}", f"e{n}", "train", shape.mask(GRID), GRID) for n, shape in enumerate(ellipsoids(4)))
     made = Provenance("made here", "CC0-1.0", "nobody", shippable=True)
     cohort = Cohort("ellipsoids", cases, (), (), (), made, NOT_STATED if side is None else side.value)
-    choices = {"objective": ObjectiveName.VARIATIONAL, "reflect": None, **more}
-    return configured_for(
-        cohort, regime=RegimeName.DENSE, latent_size=4, flow=None, ard=None, steps=8,
-        patience=0, seed=0, device=DeviceName.CPU, **choices,
-    ).reflected  # fmt: skip
+    choices = {"objective": ObjectiveName.VARIATIONAL, **more}
+    choice = TrainingChoice(regime=RegimeName.DENSE, latent_size=4, steps=8, device=DeviceName.CPU, **choices)
+    return configured_for(cohort, choice).reflected
 
 
 @pytest.mark.parametrize("side", [None, *SideName])

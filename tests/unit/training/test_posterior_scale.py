@@ -8,6 +8,8 @@ from training.posterior_scale import posterior_scale
 from training.usual import LEAST_SD, Sound, typical_figures
 
 RANDOM = np.random.default_rng(2)
+#: Log prior density of the mean shape (nats), where a model is asked for it.
+PEAK = 20.0
 
 
 def sound(scale=1.0, offset_mm=0.0, count=400, surface_scale=None):
@@ -51,17 +53,18 @@ def test_few_answers_leave_the_factor_near_that_of_the_vertices():
 
 
 def test_typical_figures_are_those_of_the_answers():
-    found = typical_figures(sound(), cases=8)
+    found = typical_figures(sound(), cases=8, peak=PEAK)
     assert found["freedom"] == 15.0
-    assert found["density_mean"] == pytest.approx(12.0, abs=0.4)
-    assert found["density_sd"] == pytest.approx(2.0, rel=0.15)
+    assert found["density_peak"] == PEAK
+    assert found["rarity_mean"] == pytest.approx(np.cbrt(PEAK - 12.0), abs=0.1)
+    assert found["rarity_sd"] == pytest.approx(2.0 / 3.0 / np.cbrt(PEAK - 12.0) ** 2, rel=0.2)
     assert found["misfit_exponent"] == pytest.approx(0.2, abs=0.15)
     assert found["misfit_sd"] == pytest.approx(0.3, rel=0.15)
     assert found["slice_sd"] == pytest.approx(0.4, rel=0.15)
 
 
 def test_alike_answers_do_not_make_the_judge_merciless():
-    found = typical_figures(sound(count=1) * 6, cases=1)
-    assert {name: found[f"{name}_sd"] for name in ("misfit", "density")} == {
-        name: LEAST_SD[name] for name in ("misfit", "density")
+    found = typical_figures(sound(count=1) * 6, cases=1, peak=PEAK)
+    assert {name: found[f"{name}_sd"] for name in ("misfit", "rarity")} == {
+        name: LEAST_SD[name] for name in ("misfit", "rarity")
     }

@@ -14,11 +14,20 @@ from model.networks.flow import FlowShape
 from model.networks.prior import PriorShape
 from tests.ellipsoid_cohort import GRID, ellipsoids
 from training.autodecoder import AutoDecoder
-from training.choices import DeviceName, ObjectiveName, RegimeName, configured
+from training.choices import DeviceName, ObjectiveName, RegimeName, TrainingChoice, configured
 from training.cohorts import Case, Cohort, Provenance
 from training.config import TrainingConfig
 from training.pruning import PriorParts
-from training.release import active_dimensions, export_run, load_module, wants_prior
+from training.release import (
+    STAGES,
+    UNCALIBRATED_PRECISION,
+    UNFINISHED,
+    Naming,
+    active_dimensions,
+    export_run,
+    load_module,
+    wants_prior,
+)
 from training.runs import RECORD, half_extent, read_record, train_cohort
 from training.seen import short_digest
 
@@ -28,6 +37,9 @@ CONFIG = TrainingConfig(
     steps=4,
     batch_shapes=3,
 )
+
+
+EGG = {"value": "102298001", "scheme": "SCT", "meaning": "Egg"}
 
 
 def ellipsoid_cohort() -> Cohort:
@@ -47,9 +59,7 @@ def run(tmp_path_factory):
 def released(run):
     output = run.parent / "bundle"
     levels = [logging.getLogger(name).level for name in ("onnxscript", "onnx_ir")]
-    manifest = export_run(
-        run, output, name="egg", version="3", likelihood_precision=0.25, accuracy={"thin": {"dice": 0.9}}
-    )
+    manifest = export_run(run, output, naming=Naming("egg", "3", EGG, 0.8))
     assert [logging.getLogger(name).level for name in ("onnxscript", "onnx_ir")] == levels
     return manifest, output
 
@@ -73,7 +83,8 @@ class TestExport:
         assert (manifest.name, manifest.version, manifest.structure) == ("egg", "3", "ellipsoids")
         assert (manifest.frame, manifest.units) == ("RAS", "mm")
         assert (manifest.licence, manifest.attribution) == ("CC0-1.0", "nobody")
-        assert (manifest.likelihood_precision, manifest.accuracy) == (0.25, {"thin": {"dice": 0.9}})
+        assert (manifest.anatomy, manifest.resolution_mm) == (EGG, 0.8)
+        assert (manifest.likelihood_precision, manifest.accuracy) == (UNCALIBRATED_PRECISION, {})
         assert manifest.half_extent_mm == tuple(half_extent(ellipsoid_cohort()))
         assert manifest.active_dimensions == active_dimensions(np.array(manifest.sigmas))
         assert manifest.training["shapes"] == 4
@@ -114,6 +125,19 @@ class TestRefusals:
         assert caught.value.part == "output"
         assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
+    def test_an_export_that_was_stopped_is_made_anew_in_the_same_folder(self, run, tmp_path):
+        def stop(words):
+            if words == STAGES[2]:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            export_run(run, tmp_path, watch=stop)
+        assert list(tmp_path.iterdir()) == []
+        (tmp_path / f"{UNFINISHED}killed").mkdir()
+        export_run(run, tmp_path)
+        assert open_bundle(tmp_path, threads=1).manifest.structure == "ellipsoids"
+        assert not list(tmp_path.glob(f"{UNFINISHED}*"))
+
     def test_an_unfinished_run_is_refused_with_where_it_stands(self, run):
         with pytest.raises(InvalidParameter, match="stands at step 4 of 9") as caught:
             load_module(run, replace(CONFIG, steps=9), 4)
@@ -148,8 +172,7 @@ def test_a_loaded_module_is_ready_for_inference(run):
     ],
 )
 def test_export_fits_the_prior_that_was_not_trained_along(tmp_path, objective, flow, ard, wanted):
-    config = configured(
-        objective, RegimeName.DENSE, 3, flow=flow, ard=ard, reflected=False, seed=0, device=DeviceName.CPU
-    )
+    choice = TrainingChoice(objective, RegimeName.DENSE, 3, flow=flow, ard=ard, device=DeviceName.CPU)
+    config = configured(choice, reflected=False)
     (tmp_path / RECORD).write_text(json.dumps({"config": config.as_dict()}))
     assert wants_prior(tmp_path) is wanted

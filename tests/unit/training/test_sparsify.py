@@ -14,7 +14,6 @@ from training.sparsify import (
     dense,
     for_evaluation,
     for_training,
-    labelled_points,
     largest_slices,
     orthogonal,
     random_slices,
@@ -42,6 +41,12 @@ def masks(draw):
 def rows(points, labels):
     """Points with labels as a set, to a micrometre."""
     return {(*np.round(point, 3).tolist(), bool(label)) for point, label in zip(points, labels, strict=True)}
+
+
+def labelled_points(drawing):
+    """World points and labels of all voxels that were looked at."""
+    index = np.argwhere(drawing.annotated)
+    return drawing.stack.grid.to_world(index.astype(float)), drawing.stack.foreground[tuple(index.T)]
 
 
 def along(values, axis):

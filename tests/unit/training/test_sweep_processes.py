@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import nibabel as nib
 import numpy as np
@@ -23,12 +24,25 @@ from training.sweep.plan import by_training, cells_of
 from training.sweep.priors import PriorName
 from training.sweep.streams import Progress, train_side_by_side
 from training.sweep.table import done, read_results
-from training.sweep.workers import Sweep, held, refusals, work, work_together
+from training.sweep.workers import Sweep, held, refusals, start_workers, work, work_together
 
 
 @pytest.fixture(scope="module")
 def masks(tmp_path_factory):
     return write_masks(tmp_path_factory.mktemp("masks"))
+
+
+def test_workers_are_told_of_one_thread_and_their_caller_keeps_its_own(masks, tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    before = dict(os.environ)
+    sweep = Sweep(CohortSource(masks=masks), CohortOptions(), (), tmp_path, Effort(), DeviceName.CPU)
+    (worker,) = start_workers(sweep, 1)
+    told = Path(f"/proc/{worker.pid}/environ").read_bytes().split(b"\0")
+    assert {b"OMP_NUM_THREADS=1", b"MKL_NUM_THREADS=1"} <= set(told)
+    assert dict(os.environ) == before
+    worker.join()
+    assert worker.exitcode == 0
 
 
 def test_a_killed_sweep_goes_on_from_its_checkpoint(masks, tmp_path, repository):

@@ -1,5 +1,6 @@
 /** The service, by addresses relative to the page. */
 
+import { saveAs } from './dom'
 import type { DrawnPlanes, Mode, ModelDescription, ModelSummary, Plane, Problem, Summary } from './types'
 import { T } from './text'
 
@@ -12,6 +13,11 @@ export class Refusal extends Error {
     readonly status: number,
   ) {
     super(message)
+  }
+
+  /** Whether the same may succeed later: nobody answered, or the service could not. */
+  get isPassing(): boolean {
+    return this.status === 0 || this.status >= 500
   }
 }
 
@@ -49,12 +55,12 @@ export class Api {
     return (await this.json<{ models: ModelSummary[] }>('v1/models')).models
   }
 
-  model(name: string): Promise<ModelDescription> {
-    return this.json(`v1/models/${encodeURIComponent(name)}`)
+  model(name: string, signal: AbortSignal): Promise<ModelDescription> {
+    return this.json(`v1/models/${encodeURIComponent(name)}`, { signal })
   }
 
-  async modes(model: string): Promise<Mode[]> {
-    return (await this.json<{ modes: Mode[] }>(`v1/models/${encodeURIComponent(model)}/modes`)).modes
+  async modes(model: string, signal: AbortSignal): Promise<Mode[]> {
+    return (await this.json<{ modes: Mode[] }>(`v1/models/${encodeURIComponent(model)}/modes`, { signal })).modes
   }
 
   planes(body: FormData, signal: AbortSignal): Promise<DrawnPlanes> {
@@ -65,8 +71,8 @@ export class Api {
     return this.json('v1/reconstructions', { method: 'POST', body, signal })
   }
 
-  summary(id: string): Promise<Summary> {
-    return this.json(resultPath(id))
+  summary(id: string, signal: AbortSignal): Promise<Summary> {
+    return this.json(resultPath(id), { signal })
   }
 
   async forget(id: string): Promise<void> {
@@ -75,10 +81,7 @@ export class Api {
 
   /** Save an answer as a file; a plain link could not send the key. */
   async download(path: string, name: string): Promise<void> {
-    const url = URL.createObjectURL(await (await this.fetch(path)).blob())
-    const link = Object.assign(document.createElement('a'), { href: url, download: name })
-    link.click()
-    setTimeout(() => URL.revokeObjectURL(url), 10_000)
+    saveAs(await (await this.fetch(path)).blob(), name)
   }
 
   private renewKey(used: string | null): Promise<void> {

@@ -34,6 +34,13 @@ export function button(label: string, onclick: () => void, attributes: Attribute
   return h('button', { type: 'button', onclick, ...attributes }, label)
 }
 
+/** Put a file into the reader's folder of downloads. */
+export function saveAs(file: Blob, name: string): void {
+  const url = URL.createObjectURL(file)
+  h('a', { href: url, download: name }).click()
+  setTimeout(() => URL.revokeObjectURL(url), 10_000)
+}
+
 /** Say how long (ms) an answer took, and which one it was: for those who measure. */
 export function mark(element: HTMLElement, duration: number): void {
   count += 1

@@ -90,8 +90,15 @@ export function voxelCount(grid: Grid): number {
   return grid.shape[0] * grid.shape[1] * grid.shape[2]
 }
 
-export function step(grid: Grid, axis: number): number {
-  return axis === 0 ? 1 : axis === 1 ? grid.shape[0] : grid.shape[0] * grid.shape[1]
+/** Numbers of all voxels of a plane. */
+export function* planeVoxels(grid: Grid, axis: number, index: number): Generator<number> {
+  const last = grid.shape.map((size, n) => (n === axis ? index : size - 1))
+  const from = (n: number): number => (n === axis ? index : 0)
+  for (let k = from(2); k <= last[2]!; k += 1) {
+    for (let j = from(1); j <= last[1]!; j += 1) {
+      for (let i = from(0); i <= last[0]!; i += 1) yield voxelNumber(grid, [i, j, k])
+    }
+  }
 }
 
 /** Voxel of a pixel of a plane's picture. */

@@ -2,6 +2,7 @@
 
 import { type Scale, legend } from './colour'
 import { button, field, h, option, replace } from './dom'
+import { slider, sliderField } from './slider'
 import { T } from './text'
 import { type Look, PLAIN_LOOK, type SurfaceView } from './viewer'
 
@@ -26,9 +27,9 @@ export class LookControls {
     replace(
       this.element,
       colouring && this.colourField(colouring),
-      field(T.look.opacity, this.opacity()),
+      sliderField(T.look.opacity, this.opacity(), T.percent),
       field(T.look.clipAxis, this.clipAxis()),
-      field(T.look.clipPlace, this.clipPlace()),
+      sliderField(T.look.clipPlace, this.clipPlace(), T.percent),
       planes && this.planesField(),
       button(T.look.reset, () => this.view.reset(), { class: 'quiet' }),
     )
@@ -81,10 +82,4 @@ export class LookControls {
     box.addEventListener('change', () => this.change({ planes: box.checked }))
     return h('label', { class: 'check' }, box, T.look.planes)
   }
-}
-
-export function slider(min: number, max: number, value: number, onChange: (value: number) => void, step = 1): HTMLInputElement {
-  const input = h('input', { type: 'range', min, max, step, value })
-  input.addEventListener('input', () => onChange(Number(input.value)))
-  return input
 }

@@ -49,10 +49,11 @@ class Page {
       this.show((this.draw ??= started(new DrawView(this.api))).element)
     } else if (route.view === 'explore') {
       this.show((this.explore ??= started(new ExploreView(this.api, route.query))).element)
-      this.explore.refresh()
+      this.explore.refresh(route.query)
     } else {
       this.show((this.reconstruct ??= started(new ReconstructView(this.api))).element)
       if (route.result) void this.reconstruct.open(route.result)
+      else this.reconstruct.refresh()
     }
   }
 

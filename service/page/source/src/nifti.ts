@@ -25,11 +25,21 @@ const HEADER_BYTES = 352
 
 /** The first volume of a NIfTI file; a sentence for anything else. */
 export function readNifti(buffer: ArrayBuffer): Volume {
+  try {
+    return volumeOf(buffer)
+  } catch (fault) {
+    throw fault instanceof NotNifti ? fault : new Error(T.brokenNifti)
+  }
+}
+
+class NotNifti extends Error {}
+
+function volumeOf(buffer: ArrayBuffer): Volume {
   const data = isCompressed(buffer) ? decompress(buffer) : buffer
   const plain = data instanceof ArrayBuffer ? data : new Uint8Array(data).slice().buffer
   const header = isNIFTI(plain) ? readHeader(plain) : null
   const known = header && READERS[header.datatypeCode]
-  if (!header || !known) throw new Error(T.notNifti)
+  if (!header || !known) throw new NotNifti(T.notNifti)
   const shape = [1, 2, 3].map((n) => Math.max(header.dims[n] ?? 1, 1)) as Vec3
   const [bytes, read] = known
   const view = new DataView(readImage(header, plain))

@@ -30,13 +30,14 @@ export class Pane {
     readonly name: PlaneName,
     public grid: Grid,
     attributes: Record<string, string | number> = { role: 'img' },
+    heading: 'h2' | 'h3' = 'h3',
   ) {
     this.layout = layoutOf(grid, name)
     this.canvas = h('canvas', { 'aria-label': T.plane[name], ...attributes })
     this.slider = h('input', { type: 'range', min: 0, max: 0, value: 0, 'aria-label': T.sliceOf(T.plane[name]) })
     this.slider.addEventListener('input', () => this.goTo(Number(this.slider.value)))
     this.canvas.addEventListener('wheel', (event) => this.scroll(event), { passive: false })
-    const head = h('header', {}, h('h3', {}, T.plane[name]), this.place)
+    const head = h('header', {}, h(heading, {}, T.plane[name]), this.place)
     this.element = h('section', { class: 'pane', 'data-plane': name }, head, this.canvas, this.slider)
     new ResizeObserver(() => this.draw()).observe(this.canvas)
     this.setGrid(grid)

@@ -21,6 +21,17 @@ export function remember(result: Known): void {
   sessionStorage.setItem(STORED, JSON.stringify([result, ...others].slice(0, MOST)))
 }
 
+const kept = new Set<string>()
+
+/** A result that somebody opened, copied the link of, or compared is not deleted by the page. */
+export function keep(id: string): void {
+  kept.add(id)
+}
+
+export function isKept(id: string): boolean {
+  return kept.has(id)
+}
+
 export function dismiss(id: string): void {
   sessionStorage.setItem(STORED, JSON.stringify(knownResults().filter((known) => known.id !== id)))
 }

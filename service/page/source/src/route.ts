@@ -10,7 +10,16 @@ export function currentRoute(): Route {
   const [view, identifier] = path.split('/')
   if (view === 'draw') return { view }
   if (view === 'explore') return { view, query: new URLSearchParams(query) }
-  return { view: 'reconstruct', result: view === 'result' && identifier ? decodeURIComponent(identifier) : null }
+  return { view: 'reconstruct', result: view === 'result' && identifier ? decoded(identifier) : null }
+}
+
+/** Without its escapes; what is not properly escaped stays as it is. */
+export function decoded(text: string): string {
+  try {
+    return decodeURIComponent(text)
+  } catch {
+    return text
+  }
 }
 
 /** Change the address without leaving what is shown. */
@@ -18,6 +27,11 @@ export function rewrite(hash: string): void {
   history.replaceState(null, '', `${location.pathname}${location.search}#/${hash}`)
 }
 
+/** What follows `#/` in the address of a result. */
+export function resultPlace(id: string): string {
+  return `result/${encodeURIComponent(id)}`
+}
+
 export function resultLink(id: string): string {
-  return `${location.origin}${location.pathname}#/result/${encodeURIComponent(id)}`
+  return `${location.origin}${location.pathname}#/${resultPlace(id)}`
 }

@@ -26,6 +26,11 @@ export class Status {
     this.wrong.textContent = text
   }
 
+  /** What went wrong is over; anything else that is said stays. */
+  recover(): void {
+    this.wrong.textContent = ''
+  }
+
   /** Steps with a bar and the time so far; `cancel` stops the work. */
   wait(steps: readonly string[], cancel: () => void): (step: number) => void {
     this.say('')

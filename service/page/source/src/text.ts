@@ -21,9 +21,13 @@ export const T = {
   cancel: 'Cancel',
   cancelled: 'Cancelled.',
   seconds: (value: number) => `${value.toFixed(1)} s`,
+  mm: (value: number) => `${value.toFixed(1)} mm`,
+  percent: (value: number) => `${value.toFixed(0)} %`,
+  plainNumber: (value: number) => value.toFixed(1),
   unreachable: 'The service does not answer. Is it running?',
   failed: (status: number) => `The service refused (status ${status}).`,
   notNifti: 'This is not a NIfTI volume of plain numbers; .nii and .nii.gz files are read.',
+  brokenNifti: 'This NIfTI file is damaged or ends too early; a whole one is read.',
   madeBy: (model: string, version: string, points: number, iterations: number) =>
     `Made by ${model} ${version} from ${points} points in ${iterations} iterations. Research software, no medical device.`,
 
@@ -124,13 +128,15 @@ export const T = {
     typicality: 'Typicality',
     percentile: (value: number) => `${value.toFixed(0)} / 100`,
     typical: (value: number) =>
-      value < 1
+      value < 0.1
         ? 'unlike anything the model has seen'
-        : value < 10
-          ? 'rarer than nine in ten known shapes'
-          : value < 25
-            ? 'somewhat unusual'
-            : 'usual for this model',
+        : value < 1
+          ? 'rarer than 99 in 100 known shapes'
+          : value < 10
+            ? 'rarer than nine in ten known shapes'
+            : value < 25
+              ? 'somewhat unusual'
+              : 'usual for this model',
     noInterval: 'no interval asked for',
     interval: (low: string, high: string, unit: string) => `90 %: ${low} to ${high} ${unit}`,
     warnings: 'Before you use this',
@@ -140,6 +146,13 @@ export const T = {
     residualHead: ['Slice', '', 'Dice'],
     axis: (axis: number) => `Axis ${'ijk'[axis]}`,
     slice: (plane: string, number: number) => `${plane} ${number}`,
+  },
+
+  place: {
+    onPlane: (plane: string, slice: number, count: number) => `${plane.toLowerCase()} slice ${slice} of ${count}`,
+    onAxis: (axis: number, slice: number) => `slice ${slice} along axis ${'ijk'[axis]}`,
+    ofFile: (place: string, file: string) => `${place} of ${file}`,
+    file: (number: number) => `file ${number}`,
   },
 
   slices: {
@@ -168,6 +181,7 @@ export const T = {
     title: 'Link to this result',
     copy: 'Copy',
     copied: 'Copied.',
+    selected: 'The browser does not copy; the link is selected, press Ctrl+C.',
     until: (date: Date) => `Kept until ${date.toLocaleString('en-GB', { dateStyle: 'medium', timeStyle: 'short' })}.`,
     gone: 'This result is no longer kept, or never was.',
   },
@@ -184,6 +198,8 @@ export const T = {
     radius: 'Brush radius',
     undo: 'Undo',
     redo: 'Redo',
+    save: 'Download drawing (NIfTI)',
+    file: 'drawing.nii.gz',
     keys: 'Arrow keys move the cursor, Space sets a corner or paints, Enter closes the contour, Escape gives it up, Page up and Page down change the slice.',
     onEmpty: 'Drag to outline the object, or click its corners and close at the first one.',
     onImage: (name: string) => `Drawing on ${name}.`,

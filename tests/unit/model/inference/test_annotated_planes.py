@@ -1,12 +1,16 @@
 """Which planes of a mask count as annotated."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from model.errors import InconsistentStacks, InvalidMask, InvalidParameter
-from model.inference.observations import Plane, find_planes
+from model.geometry import Grid
+from model.inference.observations import MaskStack, Plane, find_planes
 from tests.mask_stacks import SHAPE, centres, cut, ellipsoid, found, held, semi_axes, stack_of
 
 
@@ -160,6 +164,75 @@ def test_named_planes_that_are_not_there(plane, sentence):
 def test_fewer_than_two_named_planes(named):
     with pytest.raises(InvalidParameter, match="at least two"):
         find_planes([stack_of(ellipsoid())], named)
+
+
+def test_a_named_plane_that_was_never_looked_at_is_refused():
+    excluded = np.zeros(SHAPE, bool)
+    excluded[:, :, 20] = True
+    stack = stack_of(cut(ellipsoid(), [(2, 12)]), excluded=excluded)
+    with pytest.raises(InvalidParameter, match=r"annotated\[1\] names a plane that was never looked at") as caught:
+        find_planes([stack], [Plane(0, 2, 12), Plane(0, 2, 20), Plane(0, 2, 20)])
+    assert caught.value.part == "annotated[1]"
+    excluded[14, 16, 20] = False
+    assert len(find_planes([stack_of(stack.foreground, excluded=excluded)], [Plane(0, 2, 12), Plane(0, 2, 20)])) == 2
+
+
+def test_a_row_of_the_one_slice_that_was_looked_at_is_no_second_plane():
+    solid, excluded = cut(ellipsoid(), [(2, 12)]), np.ones(SHAPE, bool)
+    excluded[:, :, 12] = False
+    with pytest.raises(InvalidParameter, match="one slice only"):
+        find_planes([stack_of(solid, excluded=excluded)], [Plane(0, 2, 12), Plane(0, 0, 14)])
+    thin = stack_of(solid[:, :, 12:13])
+    with pytest.raises(InvalidParameter, match="one slice only"):
+        find_planes([thin], [Plane(0, 2, 0), Plane(0, 0, 14)])
+
+
+def turned(stack, angles, part="mask[1]"):
+    """The same stack, in a frame of the world that is turned."""
+    affine = np.eye(4)
+    affine[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    return replace(stack, part=part, grid=Grid(stack.grid.shape, affine @ stack.grid.affine))
+
+
+@given(st.floats(-0.49, 0.49), st.integers(0, 2), st.sampled_from(["auto", "nonempty", "named"]))
+def test_one_slice_sent_twice_is_one_slice(shift, axis, rule):
+    spacing = (1.0, 1.0, 3.0)
+    solid = cut(ellipsoid(), [(axis, 13)])
+    origin = np.zeros(3)
+    origin[axis] = shift * spacing[axis]
+    stacks = [stack_of(solid, spacing), stack_of(solid, spacing, origin=origin, part="mask[1]")]
+    if rule != "auto" and axis != 2:
+        rule = "named"
+    named = [Plane(0, axis, 13), Plane(1, axis, 13)]
+    with pytest.raises((InvalidMask, InvalidParameter), match="one slice only"):
+        find_planes(stacks, named if rule == "named" else rule)
+
+
+@pytest.mark.parametrize("rule", ["auto", "named"])
+def test_one_slice_sent_in_another_frame_of_voxels_is_one_slice(rule):
+    solid = cut(ellipsoid(), [(2, 12)])
+    one = stack_of(solid, origin=(3.0, -40.0, 7.0))
+    moved = np.moveaxis(solid[::-1], 2, 0)
+    affine = np.eye(4)
+    affine[:3, :3] = one.grid.affine[:3, :3][:, [2, 0, 1]] * (1, -1, 1)
+    affine[:3, 3] = one.grid.affine[:3, 3] + (SHAPE[0] - 1) * one.grid.affine[:3, 0]
+    two = MaskStack("mask[1]", Grid(moved.shape, affine), moved, np.zeros(moved.shape, bool))
+    named = [Plane(0, 2, 12), Plane(1, 0, 12)]
+    with pytest.raises((InvalidMask, InvalidParameter), match="one slice only"):
+        find_planes([one, two], named if rule == "named" else rule)
+
+
+def test_slices_that_are_farther_apart_or_turned_are_two():
+    one = stack_of(cut(ellipsoid(), [(2, 12)]))
+    apart = stack_of(one.foreground, origin=(0.0, 0.0, 0.6), part="mask[1]")
+    assert len(find_planes([one, apart], "auto")) == 2
+    assert len(find_planes([one, turned(one, (20, 0, 0))], "auto")) == 2
+
+
+def test_a_slice_sent_twice_beside_others_stays():
+    one = stack_of(cut(ellipsoid(), [(2, 12)]))
+    two = stack_of(cut(ellipsoid(), [(2, 12), (2, 16)]), part="mask[1]")
+    assert find_planes([one, two], "auto") == (Plane(0, 2, 12), Plane(1, 2, 12), Plane(1, 2, 16))
 
 
 def test_named_planes_without_foreground():

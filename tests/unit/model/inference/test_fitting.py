@@ -21,7 +21,7 @@ from model.inference.fitting import (
 from model.inference.objective import Objective
 from model.inference.observations import Observations, Plane
 from model.inference.posterior import fitted_logits
-from model.inference.starts import starting_poses
+from model.inference.starts import Start, starting_poses
 from tests.analytic_model import (
     MEAN_AXES,
     SPREAD,
@@ -146,7 +146,8 @@ def test_converges_from_twenty_millimetres_away(start, degrees):
     large = ellipsoid_model(mean_axes=LARGE_AXES)
     ellipsoid = Ellipsoid((50.0, 30.0, 20.0), CENTRE, rotation(degrees, (1.0, 1.0, 1.0)))
     observations = observed(drawn(ellipsoid, cube_around(CENTRE, step=2.7)), ORTHOGONAL)
-    found = fit_from(large, observations, Pose(CENTRE + start), FitOptions())
+    pose = Pose(CENTRE + start)
+    found = fit_from(large, observations, [Start(pose, pose)], FitOptions())
     assert found.status is FitStatus.CONVERGED
     assert np.linalg.norm(found.pose.position - CENTRE) < 0.5
     np.testing.assert_allclose(world_matrix(large, found), matrix_of(ellipsoid), atol=1.2)

@@ -6,9 +6,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from model.errors import InvalidParameter
-from model.inference.isosurface import extract_surface, polygonise
+from model.inference.isosurface import extract_surface
 from model.inference.mesh import area_cm2, components, is_watertight, largest_component, to_trimesh, volume_ml
 from tests.analytic_shapes import Box, Ellipsoid, Torus, sphere
+from tests.dense_fields import surface_of_nodes
 
 LOW, HIGH = np.full(3, -30.0), np.full(3, 30.0)
 TURN = Rotation.from_rotvec([0.3, 0.5, 0.2]).as_matrix()
@@ -29,7 +30,7 @@ def dense(field, step):
     axis = np.arange(-30.0, 30.0 + step / 2, step)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     values = field(points).reshape(len(axis), len(axis), len(axis)).astype(np.float32)
-    return largest_component(polygonise(values, LOW, step))[0]
+    return largest_component(surface_of_nodes(values, LOW, step))[0]
 
 
 SHAPES = {
@@ -153,7 +154,7 @@ ROUNDED = {
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.7, 1.2]), st.sampled_from(sorted(ROUNDED)))
 def test_noise_gives_closed_manifold_surfaces(seed, blur, rounding):
     values = gaussian_filter(np.random.default_rng(seed).normal(size=(9, 8, 7)), blur)
-    mesh = polygonise(ROUNDED[rounding](values).astype(np.float32), np.zeros(3), 1.0)
+    mesh = surface_of_nodes(ROUNDED[rounding](values).astype(np.float32), np.zeros(3), 1.0)
     assert is_watertight(mesh)
     assert volume_ml(mesh) > 0
 

@@ -11,10 +11,11 @@ from skimage import measure
 
 from model.bundle import open_bundle
 from model.geometry import Pose
-from model.inference.isosurface import edge_zeros, extract_surface, polygonise
+from model.inference.isosurface import edge_zeros, extract_surface
 from model.inference.mesh import Mesh, is_watertight, mesh_of
 from model.inference.surface import surface_of
 from tests.analytic_shapes import Box, Ellipsoid, Torus, sphere
+from tests.dense_fields import surface_of_nodes
 from tests.triangle_pairs import intersecting_pairs
 
 LOW, HIGH = np.full(3, -20.0), np.full(3, 20.0)
@@ -29,7 +30,7 @@ def noise(seed, blur, shape=(9, 8, 7)):
 def test_blocks_join_to_what_the_whole_grid_gives(seed):
     values = np.pad(noise(seed, 2.5, (75, 40, 70)), 1, constant_values=-1.0)
     values = np.where(np.abs(values) < 0.01, np.float32(0.01) * np.where(values > 0, 1, -1), values).astype(np.float32)
-    mesh = polygonise(values, np.zeros(3), 1.0)
+    mesh = surface_of_nodes(values, np.zeros(3), 1.0)
     vertices, faces, _, _ = measure.marching_cubes(values, 0.0, method="lewiner", gradient_direction="ascent")
     assert is_watertight(mesh)
     assert mesh.vertices.shape == vertices.shape
@@ -56,7 +57,7 @@ def test_pairs_are_found_where_there_are_some():
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.7, 1.0, 1.6]))
 def test_noise_does_not_pierce_itself(seed, blur):
-    assert intersecting_pairs(polygonise(noise(seed, blur), np.zeros(3), 1.0)) == 0
+    assert intersecting_pairs(surface_of_nodes(noise(seed, blur), np.zeros(3), 1.0)) == 0
 
 
 def slopes_of(field, points, step=1e-4):

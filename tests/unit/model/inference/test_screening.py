@@ -12,7 +12,7 @@ from model.geometry import Pose
 from model.inference.fitting import FitOptions, fit, fit_from
 from model.inference.observations import Observations, Plane
 from model.inference.screening import APART, KEPT, screened_poses
-from model.inference.starts import starting_poses
+from model.inference.starts import Start, starting_poses
 from tests.analytic_model import bent_model
 from tests.drawn_shapes import rotation
 
@@ -85,7 +85,8 @@ def talus(shipped_bundles):
 
 def distance_from_the_usual_start(model, observations):
     """How far (mm) from the truth, the origin, a fit ends that starts at the centroid of the drawing."""
-    return np.linalg.norm(fit_from(model, observations, starting_poses(observations, PLAIN)[0], PLAIN).pose.position)
+    pose = starting_poses(observations, PLAIN)[0]
+    return np.linalg.norm(fit_from(model, observations, [Start(pose, pose)], PLAIN).pose.position)
 
 
 @pytest.mark.parametrize("seed", [2, 13, 15, 16, 17, 21, 35])

@@ -1,6 +1,6 @@
 """The surface of a code and a pose, against the ellipsoid that they stand for."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.geometry import Pose
-from model.inference import posterior
 from model.inference.mesh import area_cm2, extents, is_watertight, volume_ml
-from model.inference.posterior import fitted_jacobians
+from model.inference.posterior import CHUNK, fitted_jacobians
 from model.inference.surface import BOX_MARGIN_MM, canonical_box, covering_grid, differentiated_surface, surface_of
 from model.interruption import interruptible
 from tests import few_planes
@@ -157,13 +156,27 @@ def test_nothing_has_no_derivatives():
     assert derivatives is None
 
 
-def test_what_ends_the_work_is_asked_after_every_few_points(monkeypatch):
-    told = []
-    model = interruptible(MODEL, lambda: told.append(None))
-    whole = surface_of(model, LATENT, POSE)
-    few = len(told)
-    monkeypatch.setattr(posterior, "CHUNK", 100)
-    pieces = surface_of(model, LATENT, POSE)
-    assert len(told) - few > len(pieces.vertices) / 100
-    np.testing.assert_array_equal(pieces.faces, whole.faces)
-    np.testing.assert_allclose(pieces.vertices, whole.vertices, atol=1e-9)
+@dataclass(frozen=True)
+class RecordingDecoder(EllipsoidDecoder):
+    """The ellipsoid, and how many points it was asked for each time."""
+
+    sizes: list[int] = field(default_factory=list)
+
+    def logits(self, latent, points):
+        self.sizes.append(points.shape[1])
+        return super().logits(latent, points)
+
+    def logits_and_jacobians(self, latent, points):
+        self.sizes.append(points.shape[1])
+        return super().logits_and_jacobians(latent, points)
+
+
+def test_what_ends_the_work_is_asked_before_every_few_points():
+    told, decoder = [], RecordingDecoder()
+    model = interruptible(replace(MODEL, decoder=decoder), lambda: told.append(None))
+    mesh = surface_of(model, LATENT, POSE, 0.2)
+    assert len(mesh.vertices) > 2 * CHUNK
+    assert max(decoder.sizes) <= CHUNK
+    assert len(told) == len(decoder.sizes)
+    values, gradients = ellipsoid_of(LATENT, POSE).logits_and_gradients(mesh.vertices)
+    assert np.abs(values / np.linalg.norm(gradients, axis=1)).max() < 0.005

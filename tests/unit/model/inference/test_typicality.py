@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import ndtr
 
 from model.inference.agreement import Section, sections_of
 from model.inference.fitting import FitOptions, fit
@@ -13,8 +14,10 @@ from model.inference.observations import Plane
 from model.inference.posterior import fitted_logits
 from model.inference.reliability import MOST_USUAL_PLANES, Figures
 from model.inference.typicality import (
+    peak_density,
     predictive_probabilities,
     predictive_warnings,
+    rarity,
     typicality,
     typicality_warnings,
 )
@@ -28,8 +31,9 @@ KNOWN = {
     "misfit_exponent": 0.1,
     "misfit_mean": -1.0,
     "misfit_sd": 0.2,
-    "density_mean": -4.0,
-    "density_sd": 1.0,
+    "density_peak": float(-1.5 * np.log(2.0 * np.pi)),
+    "rarity_mean": 1.0,
+    "rarity_sd": 0.3,
     "slice_mean": 0.0,
     "slice_sd": 0.2,
 }
@@ -62,6 +66,21 @@ def test_the_less_dense_the_code_the_less_typical(first, second):
     assert percentile(USUAL, latent=codes[1]) <= percentile(USUAL, latent=codes[0])
 
 
+@pytest.mark.parametrize("dimensions", [3, 10, 30])
+def test_as_many_real_shapes_lie_below_a_percentile_as_it_says(dimensions):
+    random = np.random.default_rng(dimensions)
+    densities = -0.5 * np.square(random.standard_normal((40_000, dimensions))).sum(axis=1)
+    rare = rarity(densities, 0.0)
+    tails = 1.0 - ndtr((rare - rare.mean()) / rare.std())
+    for share, tolerance in ((0.05, 0.01), (0.01, 0.004), (0.001, 0.0008)):
+        assert np.mean(tails < share) == pytest.approx(share, abs=tolerance)
+
+
+def test_the_mean_shape_has_the_density_that_others_are_held_against():
+    assert peak_density(PLAIN) == pytest.approx(KNOWN["density_peak"])
+    assert rarity(np.array([peak_density(PLAIN)]), peak_density(PLAIN)) == 0.0
+
+
 def test_a_usual_shape_is_typical_with_any_number_of_planes():
     for planes in (2, 5, 20):
         usual = USUAL * (planes / 5.0) ** 0.1
@@ -92,6 +111,15 @@ def test_a_plane_that_surprises_is_told_of_unless_it_is_named_elsewhere():
     assert "mask[0] axis 2 index 2" in sentence
     assert "index 3" not in sentence
     assert "index 4" not in sentence
+
+
+def test_of_many_planes_the_one_that_surprises_more_than_the_others_is_told_of():
+    random = np.random.default_rng(1)
+    sections = [section(1.0 + random.normal(0.0, 0.3), index) for index in range(40)]
+    assert min(predictive_probabilities(MODEL, sections)) > 1e-3
+    assert min(predictive_probabilities(MODEL, sections[:MOST_USUAL_PLANES])) < 1e-3
+    chances = predictive_probabilities(MODEL, [*sections, section(4.0, 40)])
+    assert chances[40] < 1e-3 < min(chances[:40])
 
 
 def test_a_model_that_was_not_calibrated_does_not_judge_slices():

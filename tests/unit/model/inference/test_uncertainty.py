@@ -28,7 +28,6 @@ from model.inference.posterior import (
     laplace_covariance,
     logit_variance,
     mean_probability,
-    parameter_draws,
 )
 from model.inference.surface import canonical_box, surface_of
 from model.inference.uncertainty import (
@@ -42,6 +41,7 @@ from model.inference.uncertainty import (
 from tests.analytic_model import ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import PARALLEL, cube_around, drawn, observed, rotation
+from tests.posterior_draws import parameter_draws
 
 CENTRE = np.array([30.0, -20.0, 50.0])
 MODEL = ellipsoid_model()
@@ -83,7 +83,7 @@ def fitted_covariance():
 @pytest.mark.parametrize("covariance", [covariance_of(latent=(0.1, 0.2, 0.05), scale=0.01), fitted_covariance()])
 def test_intervals_are_those_of_draws_from_the_posterior(covariance):
     spread = surface_spread(MODEL, ShapeState((FIT,), covariance), MESH)
-    shapes = [ellipsoid_of(moved(step)) for step in parameter_draws(covariance, 4000, seed=0)]
+    shapes = [ellipsoid_of(moved(step)) for step in parameter_draws(covariance, 2000, seed=0)]
     for estimate, drawn_figures in (
         (volume_estimate(MESH, spread), [shape.volume_ml for shape in shapes]),
         (area_estimate(MESH, spread), [shape.area_cm2 for shape in shapes]),
@@ -96,7 +96,7 @@ def test_intervals_are_those_of_draws_from_the_posterior(covariance):
 def test_intervals_are_those_of_meshes_of_draws():
     covariance = covariance_of(latent=(0.1, 0.2, 0.05), position=0.5, rotation=0.1, scale=0.01)
     spread = surface_spread(MODEL, ShapeState((FIT,), covariance), MESH)
-    fits = [moved(step) for step in parameter_draws(covariance, 200, seed=0)]
+    fits = [moved(step) for step in parameter_draws(covariance, 100, seed=0)]
     meshes = [surface_of(MODEL, each.latent, each.pose, 1.5) for each in fits]
     for estimate, figure in ((volume_estimate(MESH, spread), volume_ml), (area_estimate(MESH, spread), area_cm2)):
         drawn_sd = np.std([figure(mesh) for mesh in meshes])
@@ -151,7 +151,7 @@ def test_what_refits_have_in_common_widens_an_ensemble_as_it_widens_laplace():
 
 
 def test_ensemble_interval_is_that_of_its_volumes():
-    steps = parameter_draws(covariance_of(latent=(0.1, 0.2, 0.05)), 24, seed=3)
+    steps = parameter_draws(covariance_of(latent=(0.1, 0.2, 0.05)), 12, seed=3)
     members = tuple(moved(step) for step in steps)
     spread = surface_spread(MODEL, ShapeState((FIT, *members), None), MESH)
     of_members = np.std([ellipsoid_of(member).volume_ml for member in members], ddof=1)
@@ -265,7 +265,7 @@ def test_uncertain_occupancy_is_the_posterior_mean(grid):
 
 def test_far_from_the_surface_an_ensemble_is_as_sure_as_its_members():
     """There the fit's label stands for theirs."""
-    members = tuple(moved(step) for step in parameter_draws(covariance_of(latent=0.2, position=0.5), 4, seed=0))
+    members = tuple(moved(step) for step in parameter_draws(covariance_of(latent=0.2, position=0.5), 2, seed=0))
     half = canonical_box(MODEL).max()
     grid = Grid(
         (24, 24, 24), np.diag([*[2.0 * half / 23] * 3, 1.0]) + np.pad((CENTRE - half)[:, None], ((0, 1), (3, 0)))
@@ -277,7 +277,7 @@ def test_far_from_the_surface_an_ensemble_is_as_sure_as_its_members():
 
 
 def test_ensemble_occupancy_is_the_mean_of_its_members():
-    members = tuple(moved(step) for step in parameter_draws(covariance_of(latent=0.3, position=0.5), 6, seed=0))
+    members = tuple(moved(step) for step in parameter_draws(covariance_of(latent=0.3, position=0.5), 3, seed=0))
     grid = cube_around(CENTRE, step=2.0, nodes=15)
     values = occupancy(MODEL, ShapeState((FIT, *members), None), grid).reshape(-1)
     single = [occupancy(MODEL, ShapeState((member,), None), grid).reshape(-1) for member in members]

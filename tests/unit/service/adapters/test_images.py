@@ -202,33 +202,6 @@ def test_declared_space_of_nrrd_becomes_ras(space, signs):
     np.testing.assert_allclose(stack.grid.affine[:3, :3], expected)
 
 
-def layered_segmentation(layers):
-    header = (
-        "NRRD0004\ntype: uchar\ndimension: 4\nspace: left-posterior-superior\n"
-        f"sizes: {len(layers)} 6 7 8\nspace directions: none (2,0,0) (0,1,0) (0,0,1)\n"
-        "kinds: list domain domain domain\nencoding: gzip\nspace origin: (1,2,3)\nSegment0_LabelValue:=1\n\n"
-    )
-    return header.encode() + gzip.compress(np.stack(layers).tobytes(order="F"))
-
-
-def test_overlapping_layers_of_a_segmentation_are_merged():
-    first, second = drawn((2,)), drawn((2, 6))
-    stack = read_mask(layered_segmentation([first, second]), "mask[0]", LIMITS)
-    np.testing.assert_array_equal(stack.foreground, (first > 0) | (second > 0))
-    np.testing.assert_allclose(stack.grid.spacing, (2, 1, 1))
-    np.testing.assert_allclose(stack.grid.affine[:3, 3], (-1, -2, 3))
-
-
-def test_labels_in_overlapping_layers_are_ambiguous():
-    with pytest.raises(InvalidMask, match="ambiguous"):
-        read_mask(layered_segmentation([drawn(), drawn()]), "mask[0]", LIMITS, frozenset({1}))
-
-
-def test_one_layer_may_be_picked_by_label():
-    stack = read_mask(layered_segmentation([drawn()]), "mask[0]", LIMITS, frozenset({1}))
-    np.testing.assert_array_equal(stack.foreground, drawn() == 1)
-
-
 @pytest.mark.parametrize(
     ("data", "found"),
     [(nifti(drawn()), "nifti"), (nrrd_text("6 7 8"), "nrrd"), (mha_text(), "metaimage"), (b"PK\3\4" * 200, None)],
@@ -244,47 +217,6 @@ def test_a_limit_is_inclusive():
     for limits in (ImageLimits(len(data) - 1, drawn().size), ImageLimits(len(data), drawn().size - 1)):
         with pytest.raises(TooLarge):
             read_mask(data, "mask[0]", limits)
-
-
-SOUND = {
-    "nifti": nifti(drawn(), zipped=False),
-    "nifti gzip": nifti(drawn()),
-    "nifti 2": nib.Nifti2Image(drawn(), np.eye(4)).to_bytes(),
-    "nrrd": nrrd_text("6 7 8"),
-    "nrrd layers": layered_segmentation([drawn(), drawn()]),
-    "metaimage": mha_text(),
-}
-
-
-@given(st.sampled_from(sorted(SOUND)), st.data())
-def test_damage_anywhere_is_read_or_refused_and_never_crashes(name, data):
-    damaged = bytearray(SOUND[name])
-    head = min(len(damaged), 400)
-    for _ in range(data.draw(st.integers(1, 6))):
-        damaged[data.draw(st.integers(0, head - 1))] = data.draw(st.integers(0, 255))
-    end = data.draw(st.sampled_from([len(damaged), len(damaged) // 2, head]))
-    try:
-        stack = read_mask(bytes(damaged[:end]), "mask[0]", LIMITS)
-    except InputError:
-        return
-    assert stack.foreground.shape == stack.grid.shape
-    assert np.isfinite(stack.grid.affine).all()
-
-
-@given(st.sampled_from(["nrrd", "nrrd layers", "metaimage"]), st.data())
-def test_any_value_of_a_text_header_is_read_or_refused(name, data):
-    head, sign, _ = SOUND[name].partition(b"\n\n" if "nrrd" in name else b"LOCAL\n")
-    lines = (head + sign).split(b"\n")
-    number = data.draw(st.integers(1, len(lines) - 1))
-    key = lines[number].split(b":" if "nrrd" in name else b"=")[0]
-    words = st.sampled_from(["nan", "inf", "-1", "0", "1e400", "none", "()", "(1,2", "9" * 5000, "x", "", "3"])
-    value = " ".join(data.draw(st.lists(words, max_size=4)))
-    lines[number] = key + (b": " if "nrrd" in name else b"= ") + value.encode()
-    try:
-        stack = read_mask(b"\n".join(lines) + SOUND[name][len(head + sign) :], "mask[0]", LIMITS)
-    except InputError:
-        return
-    assert np.isfinite(stack.grid.affine).all()
 
 
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from([bool, np.uint8, np.float32]))

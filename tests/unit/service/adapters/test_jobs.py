@@ -1,19 +1,27 @@
 """The engine of jobs on real databases: SQLite always, PostgreSQL where one listens on this machine."""
 
+import io
+import json
 import subprocess
 import sys
 import threading
 import time
 from datetime import UTC, datetime, timedelta
 
+import psycopg
 import pytest
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ProgrammingError
 
+from benchmarks.ports import free_port
 from model.errors import InvalidMask
 from service.adapters.jobs.client import DbosJobs
-from service.adapters.jobs.database import Leases
+from service.adapters.jobs.database import Leases, bounded
 from service.adapters.jobs.worker import WorkerOptions, running_worker
-from service.errors import UnknownJob
+from service.errors import Overloaded, StoreFull, UnknownJob
 from service.job_ports import JobKind, JobState, JobStatus
+from service.observability import make_log
+from tests.small_disks import fill, small_disk
 
 
 def squares(seen: list[int], fail: tuple[int, ...] = ()) -> JobKind:
@@ -187,3 +195,83 @@ def test_leases_run_out(url):
         assert leases.alive(60.0) == 1
     assert leases.alive(60.0) == 0
     leases.close()
+
+
+@pytest.mark.parametrize("name", ["\0", "", "nothing", "../x", "{00000000-0000-4000-8000-000000000000}", "\ud800"])
+def test_what_is_no_identifier_names_no_job(url, name):
+    jobs = DbosJobs(url)
+    for ask in (jobs.status, jobs.cancel):
+        with pytest.raises(UnknownJob):
+            ask(name)
+    jobs.close()
+
+
+def test_a_silent_peer_is_bounded_and_what_an_address_says_stays():
+    asked = make_url(bounded("postgresql://user:p%40s@host/name?tcp_user_timeout=1"))
+    assert asked.query["tcp_user_timeout"] == "1"
+    assert {"connect_timeout", "keepalives_idle", "keepalives_interval", "keepalives_count"} <= set(asked.query)
+    assert asked.password == "p@s"
+    assert bounded("sqlite:////folder/file") == "sqlite:////folder/file"
+
+
+def entries(log):
+    return [json.loads(line) for line in log.getvalue().splitlines()]
+
+
+def test_a_database_that_lacks_its_tables_is_a_fault_and_no_wait(postgres_url):
+    log = io.StringIO()
+    jobs = DbosJobs(postgres_url, make_log("debug", log))
+    identifier = jobs.new_id("squares")
+    assert jobs.known([identifier]) == set()
+    with psycopg.connect(postgres_url, autocommit=True) as connection:
+        connection.execute("DROP SCHEMA dbos CASCADE")
+    with pytest.raises(ProgrammingError):
+        jobs.status(identifier)
+    (entry,) = entries(log)
+    assert (entry["kind"], entry["state"]) == ("ProgrammingError", "42P01")
+    assert identifier not in log.getvalue()
+    jobs.close()
+
+
+def test_a_database_that_is_not_there_is_a_wait():
+    log = io.StringIO()
+    jobs = DbosJobs(f"postgresql://nobody@127.0.0.1:{free_port()}/of_nobody", make_log("debug", log))
+    with pytest.raises(Overloaded):
+        jobs.unfinished()
+    assert {entry["kind"] for entry in entries(log)} == {"OperationalError"}
+    assert "of_nobody" not in log.getvalue()
+    jobs.close()
+
+
+@pytest.fixture
+def disk(tmp_path):
+    with small_disk(tmp_path / "disk", "2m") as folder:
+        yield folder
+
+
+def enqueue_many(jobs):
+    for _ in range(100):
+        jobs.enqueue("squares", {"text": "x" * 20_000}, jobs.new_id("squares"))
+
+
+@pytest.mark.parametrize("opened", [True, False], ids=["while it runs", "from the first"])
+def test_a_disk_without_room_takes_no_job_and_takes_one_again_later(disk, opened):
+    jobs = DbosJobs(f"sqlite:///{disk / 'folder' / 'jobs.sqlite'}")
+    if opened:
+        jobs.unfinished()
+    ballast = fill(disk)
+    with pytest.raises((StoreFull, Overloaded)):
+        enqueue_many(jobs)
+    ballast.unlink()
+    identifier = jobs.new_id("squares")
+    assert jobs.enqueue("squares", {"count": 1}, identifier).id == identifier
+    jobs.close()
+
+
+def test_a_full_database_says_that_it_has_no_room(disk):
+    jobs = DbosJobs(f"sqlite:///{disk / 'jobs.sqlite'}")
+    jobs.unfinished()
+    fill(disk)
+    with pytest.raises(StoreFull):
+        enqueue_many(jobs)
+    jobs.close()

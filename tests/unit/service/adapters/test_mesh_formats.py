@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from model.errors import InvalidParameter
 from model.inference.isosurface import extract_surface
-from model.inference.mesh import Mesh, empty_mesh, from_trimesh, volume_ml
+from model.inference.mesh import Mesh, empty_mesh, volume_ml
 from service.adapters.mesh_formats import colours, write_mesh
 from service.ports import MeshFormat
-from tests.analytic_shapes import Ellipsoid
+from tests.analytic_shapes import Box, Ellipsoid
 from tests.service_parts import tetrahedron
 
 SHAPE = Ellipsoid((7.0, 9.0, 12.0), np.array([30.0, -12.0, 5.0]))
@@ -209,7 +209,7 @@ def test_scalars_of_both_signs_are_coloured_alike_to_both_sides_of_zero(values):
 
 @given(st.text(max_size=40))
 def test_no_metadata_breaks_a_file(text):
-    box = from_trimesh(trimesh.creation.box())
+    box = Box((0.5, 0.5, 0.5)).surface
     box = box.with_scalars(surface_sd_mm=np.arange(8.0))
     for format in FORMATS:
         _, faces, _, _ = READERS[format](write_mesh(box, format, metadata={"note": text}))

@@ -1,11 +1,14 @@
 """Work in other processes gives what it gives here, ends when nobody waits, and outlives a process that dies."""
 
+import json
+import multiprocessing
 import os
 import signal
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from io import StringIO
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from model.errors import InvalidParameter
 from service.adapters.processes import compute_here, spread
 from service.errors import HelperLost
 from service.model_registry import ModelRegistry
+from service.observability import make_log
 from tests.analytic_model import ellipsoid_model
 
 pytestmark = pytest.mark.slow
@@ -23,12 +27,26 @@ def open_models():
     return ModelRegistry({"ellipsoid": ellipsoid_model("ellipsoid")})
 
 
+def never_opened():
+    threading.Event().wait(600.0)
+
+
 def where(model, *, watch, check):
-    """The process that computes, after a while."""
+    """The process that computes."""
+    watch("computing")
+    check()
+    return os.getpid(), model.manifest.name
+
+
+def meet(model, folder, *, watch, check):
+    """The process that computes, once another one computes too."""
     watch("waiting")
-    for _ in range(10):
+    (folder / str(os.getpid())).touch()
+    end = time.monotonic() + 60.0
+    while len(list(folder.iterdir())) < 2:
         check()
-        time.sleep(0.02)
+        assert time.monotonic() < end
+        time.sleep(0.01)
     return os.getpid(), model.manifest.name
 
 
@@ -48,6 +66,20 @@ def never(model, *, watch, check):  # noqa: ARG001
 
 def logits(model, latent, points, *, watch, check):  # noqa: ARG001
     return model.decoder.logits(latent, points)
+
+
+def unsendable(model, *, watch, check):  # noqa: ARG001
+    return lambda: model
+
+
+def opened_at_the_third_try(folder):
+    tries = len(list(folder.iterdir()))
+    (folder / str(tries)).touch()
+    if tries == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if tries == 1:
+        raise MemoryError
+    return open_models()
 
 
 def die(model, *, watch, check):  # noqa: ARG001
@@ -96,9 +128,9 @@ def elsewhere(processes, model, work, *arguments, **more):
             held.result()
 
 
-def test_two_calls_at_once_are_in_two_processes_one_of_them_this(processes, model):
+def test_two_calls_at_once_are_in_two_processes_one_of_them_this(processes, model, tmp_path):
     told = []
-    work = partial(processes, where, model, watch=told.append)
+    work = partial(processes, meet, model, tmp_path, watch=told.append)
     found = at_once(work, work)
     assert {name for _, name in found} == {"ellipsoid"}
     assert len({pid for pid, _ in found}) == 2
@@ -135,10 +167,8 @@ def test_what_a_check_raises_ends_the_work_and_the_helper_takes_the_next(process
         if next(calls) > 3:
             raise TimeoutError
 
-    began = time.monotonic()
     with pytest.raises(TimeoutError):
         elsewhere(processes, model, never, check=check)
-    assert time.monotonic() - began < 20.0
     assert elsewhere(processes, model, where)[0] != os.getpid()
 
 
@@ -156,9 +186,41 @@ def test_a_helper_that_dies_costs_one_call_and_another_takes_its_place(processes
     assert after not in (before, os.getpid())
 
 
+def entries(log):
+    return [json.loads(line) for line in log.getvalue().splitlines()]
+
+
+def test_the_loss_of_a_helper_is_told(model):
+    log = StringIO()
+    with spread(1, open_models, make_log("info", log)) as opened:
+        wait_for_helper(opened)
+        with pytest.raises(HelperLost):
+            elsewhere(opened, model, die)
+    (lost,) = entries(log)
+    assert (lost["event"], lost["helper"], lost["status"]) == ("helper ended and is started again", 1, -signal.SIGKILL)
+
+
+def test_a_helper_that_ends_before_it_has_opened_its_models_is_followed_by_another(model, tmp_path):
+    log = StringIO()
+    with spread(1, partial(opened_at_the_third_try, tmp_path), make_log("info", log)) as opened:
+        wait_for_helper(opened)
+        assert elsewhere(opened, model, where)[0] != os.getpid()
+    killed, failed = entries(log)
+    assert killed["status"] == -signal.SIGKILL
+    assert failed["exception"][0]["raised"] == ["MemoryError"]
+
+
+def test_a_result_that_no_pipe_can_carry_is_a_fault_of_its_call_alone(processes, model):
+    before = elsewhere(processes, model, where)[0]
+    with pytest.raises(RuntimeError, match="pickle"):
+        elsewhere(processes, model, unsendable)
+    assert elsewhere(processes, model, where)[0] == before
+
+
 def test_a_helper_that_died_while_nothing_was_asked_of_it_costs_nothing(processes, model):
-    os.kill(elsewhere(processes, model, where)[0], signal.SIGKILL)
-    time.sleep(0.2)
+    helper = elsewhere(processes, model, where)[0]
+    os.kill(helper, signal.SIGKILL)
+    os.waitid(os.P_PID, helper, os.WEXITED | os.WNOWAIT)
     assert elsewhere(processes, model, where)[0] == os.getpid()
     wait_for_helper(processes)
     assert elsewhere(processes, model, where)[0] != os.getpid()
@@ -173,7 +235,8 @@ def test_helpers_end_with_the_context():
 
 
 def test_helpers_that_are_not_there_yet_do_not_hold_the_end_up():
-    began = time.monotonic()
-    with spread(2, open_models):
-        pass
-    assert time.monotonic() - began < 20.0
+    before = set(multiprocessing.active_children())
+    with spread(2, never_opened) as opened:
+        assert len(set(multiprocessing.active_children()) - before) == 2
+        assert opened.free() == 1
+    assert set(multiprocessing.active_children()) <= before

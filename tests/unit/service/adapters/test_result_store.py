@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import stat
-import time
 
 import numpy as np
 import pytest
@@ -158,9 +157,14 @@ def test_another_format_is_not_read(store, tmp_path):
         store.load(kept.id)
 
 
-def test_the_oldest_make_room_for_the_new(tmp_path, clock):
+@pytest.fixture
+def size(tmp_path, clock):
+    """Bytes of a result on disk."""
     probe = DiskResultStore(tmp_path / "p", lifetime_s=100.0, max_bytes=10**9, clock=clock)
-    size = sum(file.stat().st_size for file in (tmp_path / "p" / probe.save(outcome_of()).id).iterdir())
+    return sum(file.stat().st_size for file in (tmp_path / "p" / probe.save(outcome_of()).id).iterdir())
+
+
+def test_the_oldest_make_room_for_the_new(tmp_path, clock, size):
     store = DiskResultStore(tmp_path / "r", lifetime_s=100.0, max_bytes=int(2.5 * size), clock=clock)
     kept = []
     for _ in range(3):
@@ -171,19 +175,19 @@ def test_the_oldest_make_room_for_the_new(tmp_path, clock):
     assert [store.load(identifier).id for identifier in kept[1:]] == kept[1:]
 
 
-def test_results_of_other_processes_make_room_too(tmp_path, clock, monkeypatch):
-    mine, theirs = (DiskResultStore(tmp_path, lifetime_s=100.0, max_bytes=10**9, clock=clock) for _ in range(2))
+@pytest.mark.parametrize("passed_s", [1.0, -3600.0], ids=["a second later", "with a clock set back"])
+def test_results_of_other_processes_make_room_too(tmp_path, clock, size, passed_s):
+    place = tmp_path / "r"
+    mine, theirs = (
+        DiskResultStore(place, lifetime_s=10_000.0, max_bytes=most, clock=clock) for most in (int(2.5 * size), 10**9)
+    )
     first = mine.save(outcome_of()).id
-    size = sum(file.stat().st_size for file in (tmp_path / first).iterdir())
-    monkeypatch.setattr(mine, "_max_bytes", int(2.5 * size))
     for _ in range(2):
-        clock.now += 1.0
+        clock.now += 0.1
         theirs.save(outcome_of())
-    begun = time.monotonic()
-    monkeypatch.setattr(time, "monotonic", lambda: begun + 1.0)
-    clock.now += 1.0
+    clock.now += passed_s
     mine.save(outcome_of())
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list(place.iterdir())) == 2
     with pytest.raises(UnknownResult):
         theirs.load(first)
 

@@ -26,7 +26,7 @@ export class Pen {
   private down: { x: number; y: number; last: Point; dragged: boolean } | null = null
 
   constructor(
-    private readonly pane: Pane,
+    readonly pane: Pane,
     private readonly tool: () => Tool,
     private readonly committed: Committed,
   ) {
@@ -45,6 +45,18 @@ export class Pen {
     this.contour = []
     this.pending.clear()
     this.down = null
+    this.pane.draw()
+  }
+
+  /** Whether there is a contour that is not closed yet. */
+  get isOpen(): boolean {
+    return this.contour.length > 0
+  }
+
+  /** Take back the last corner of an open contour; not while it is being dragged. */
+  takeBack(): void {
+    if (this.down) return
+    this.contour.pop()
     this.pane.draw()
   }
 

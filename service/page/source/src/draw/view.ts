@@ -1,26 +1,34 @@
 /** Draw contours on three planes; the surface follows each time the pen is lifted. */
 
+import { gzipSync } from 'fflate'
 import { type Api, formOf, isAbort, resultPath, sentence } from '../api'
 import { scaleFromZero } from '../colour'
-import { button, field, h, mark, replace } from '../dom'
+import { button, field, h, mark, replace, saveAs } from '../dom'
 import { PLANES, planeName } from '../grid'
-import { LookControls, slider } from '../look'
+import { LookControls } from '../look'
 import { readMz3 } from '../mesh'
-import { modelOptions } from '../models'
+import { loadedModels, modelOptions } from '../models'
 import { readNifti, writeNifti } from '../nifti'
 import { Pane } from '../pane'
-import { dismiss, remember } from '../results'
+import { warningsInWords } from '../places'
+import { dismiss, isKept, keep, remember } from '../results'
+import { resultPlace } from '../route'
 import { type Placed, placed } from '../section'
 import { Status } from '../status'
 import { T } from '../text'
-import type { Grid, Plane, Summary } from '../types'
+import type { Plane, Summary } from '../types'
 import { SurfaceView } from '../viewer'
-import { type Backdrop, backdropOf, drawOver, emptyGrid, paintOf } from './canvas'
+import { backdropOf, drawOver, emptyGrid, paintOf } from './canvas'
 import { Drawing } from './drawing'
+import { type Way, listenForSteps } from './keys'
 import { Pen, type Tool } from './pen'
+import { type Sheet, Sheets } from './sheets'
 import { type Suggestion, nextPlane } from './suggestion'
+import { toolChoices } from './tools'
 
 const FEWEST_PLANES = 2
+/** What a reader does to a link who wants to have what it leads to. */
+const TAKING = ['click', 'auxclick', 'contextmenu', 'dragstart']
 
 export class DrawView {
   readonly element: HTMLElement
@@ -28,56 +36,92 @@ export class DrawView {
   private readonly surface = new SurfaceView(T.result.surface)
   private readonly look = new LookControls(this.surface)
   private readonly model = h('select')
+  private readonly image = h('input', { type: 'file', accept: '.nii,.nii.gz,.gz' })
   private readonly panes = h('div', { class: 'panes' })
   private readonly told = h('div', { class: 'told' })
   private readonly undo = button(T.draw.undo, () => this.step('undo'), { disabled: true })
   private readonly redo = button(T.draw.redo, () => this.step('redo'), { disabled: true })
+  private readonly save = button(T.draw.save, () => this.download(), { disabled: true })
   private readonly tool: Tool = { kind: 'polygon', erase: false, radiusMm: 2 }
-  private drawing: Drawing | null = null
-  private backdrop: Backdrop | null = null
-  private canvases: Pane[] = []
+  private readonly sheets = new Sheets()
+  private pens: Pen[] = []
   private next: Suggestion | null = null
   private placed: Placed | null = null
+  private beginning = new AbortController()
   private working = new AbortController()
   private shown: string | null = null
 
   constructor(private readonly api: Api) {
-    this.model.addEventListener('change', () => void this.begin(null))
+    this.model.addEventListener('change', () => void this.changeModel())
+    this.image.addEventListener('change', () => void this.begin(this.image.files?.[0] ?? null))
     const stage = h('div', { class: 'stage' }, this.surface.element, this.look.legend)
     this.look.element.hidden = true
-    const side = h('aside', { class: 'side' }, h('h1', {}, T.draw.title), h('p', {}, T.draw.how), this.setup(), this.tools(), this.status.element, this.told)
+    const tools = toolChoices(this.tool, this.undo, this.redo)
+    const side = h('aside', { class: 'side' }, h('h1', {}, T.draw.title), h('p', {}, T.draw.how), this.setup(), tools, this.save, this.status.element, this.told)
     const solid = h('div', { class: 'solid' }, stage, this.look.element)
     this.element = h('div', { class: 'split' }, side, h('div', { class: 'main drawing' }, this.panes, solid))
-    this.element.addEventListener('keydown', (event) => this.key(event))
+    listenForSteps(this.element, (way) => this.step(way))
+    window.addEventListener('beforeunload', (event) => {
+      if (this.drawing?.isSaved === false) event.preventDefault()
+    })
   }
 
   async start(): Promise<void> {
     try {
-      const models = await this.api.models()
+      const models = await loadedModels(this.api, (fault) => this.status.fail(sentence(fault)))
+      this.status.recover()
       replace(this.model, ...modelOptions(models))
-      await this.begin(null)
+      if (!this.sheets.current) await this.begin(null)
     } catch (fault) {
       this.status.fail(sentence(fault))
     }
+  }
+
+  private get drawing(): Drawing | null {
+    return this.sheets.current?.drawing ?? null
+  }
+
+  private get canvases(): Pane[] {
+    return this.pens.map((pen) => pen.pane)
   }
 
   /** A new drawing on an image's grid, or on an empty one that fits the model. */
   private async begin(image: File | null): Promise<void> {
+    this.beginning.abort()
+    this.beginning = new AbortController()
+    const { signal } = this.beginning
     try {
-      const volume = image && readNifti(await image.arrayBuffer())
-      const grid: Grid = volume ?? emptyGrid((await this.api.model(this.model.value)).half_extent_mm)
-      this.backdrop = volume && backdropOf(volume.values)
-      this.setDrawing(new Drawing({ shape: grid.shape, affine: grid.affine }))
-      this.status.say(image ? T.draw.onImage(image.name) : T.draw.onEmpty)
+      const sheet = await this.sheetOf(image, signal)
+      signal.throwIfAborted()
+      this.sheets.begin(sheet)
+      this.showSheet(sheet)
+      this.status.say(this.hint())
     } catch (fault) {
-      this.status.fail(sentence(fault))
+      if (!isAbort(fault)) this.status.fail(sentence(fault))
     }
   }
 
-  private setDrawing(drawing: Drawing): void {
+  private async sheetOf(image: File | null, signal: AbortSignal): Promise<Sheet> {
+    const volume = image && readNifti(await image.arrayBuffer())
+    const { shape, affine } = volume ?? emptyGrid((await this.api.model(this.model.value, signal)).half_extent_mm)
+    return { drawing: new Drawing({ shape, affine }), image, backdrop: volume && backdropOf(volume.values) }
+  }
+
+  /** What is drawn is fitted by the other model; where nothing is, there is a new grid that fits it. */
+  private async changeModel(): Promise<void> {
+    if (this.sheets.isBlank) await this.begin(null)
+    else {
+      this.clearSurface()
+      await this.update()
+    }
+  }
+
+  private showSheet(sheet: Sheet): void {
     this.working.abort()
-    this.drawing = drawing
-    this.canvases = PLANES.map((name) => this.pane(name, drawing))
+    const chosen = new DataTransfer()
+    if (sheet.image) chosen.items.add(sheet.image)
+    this.image.files = chosen.files
+    this.pens = PLANES.map((name) => this.pen(name, sheet))
     replace(this.panes, ...this.canvases.map((pane) => pane.element))
     this.clearSurface()
     this.tellSteps()
@@ -91,32 +135,56 @@ export class DrawView {
     for (const pane of this.canvases) pane.draw()
   }
 
-  private pane(name: (typeof PLANES)[number], drawing: Drawing): Pane {
-    const pane = new Pane(name, drawing.grid, { tabindex: 0, role: 'application', 'aria-label': `${T.plane[name]}. ${T.draw.keys}` })
+  private pen(name: (typeof PLANES)[number], { drawing, backdrop }: Sheet): Pen {
+    const pane = new Pane(name, drawing.grid, { tabindex: 0, role: 'application', 'aria-label': `${T.plane[name]}. ${T.draw.keys}` }, 'h2')
     const pen = new Pen(pane, () => this.tool, (where, voxels, value) => this.commit(where, voxels, value))
     pane.show(
-      paintOf(drawing, this.backdrop, () => pen, () => this.tool),
+      paintOf(drawing, backdrop, () => pen, () => this.tool),
       (context) => drawOver(context, pane, pen, drawing, { next: this.next?.plane ?? null, surface: this.placed }),
     )
-    return pane
+    return pen
   }
 
   private commit(pane: Pane, voxels: number[], value: 0 | 1): void {
-    if (!this.drawing?.apply(pane.layout.axis, pane.slice, voxels, value)) return
+    if (!this.sheets.apply(pane.layout.axis, pane.slice, voxels, value)) return
     this.tellSteps()
     void this.update()
   }
 
-  private step(way: 'undo' | 'redo'): void {
-    this.drawing?.[way]()
+  /** An open contour loses its last corner; otherwise a stroke, or a new drawing, is taken back or done again. */
+  private step(way: Way): void {
+    const open = this.pens.filter((pen) => pen.isOpen)
+    const pen = open.find((one) => one.pane.canvas === document.activeElement) ?? open[0]
+    if (way === 'undo' && pen) pen.takeBack()
+    else if (way === 'undo' ? this.sheets.canUndo : this.sheets.canRedo) this.turn(way)
+  }
+
+  private turn(way: Way): void {
+    const before = this.sheets.current
+    this.sheets[way]()
+    const sheet = this.sheets.current!
+    if (sheet !== before) this.showSheet(sheet)
     this.tellSteps()
     void this.update()
   }
 
   private tellSteps(): void {
-    this.undo.disabled = !this.drawing?.canUndo
-    this.redo.disabled = !this.drawing?.canRedo
+    this.undo.disabled = !this.sheets.canUndo
+    this.redo.disabled = !this.sheets.canRedo
+    this.save.disabled = this.drawing?.annotated.length === 0
     for (const pane of this.canvases) pane.draw()
+  }
+
+  private download(): void {
+    const drawing = this.drawing!
+    saveAs(new Blob([gzipSync(writeNifti(drawing.grid, drawing.save())).slice()]), T.draw.file)
+  }
+
+  /** What to do while there is nothing to fit. */
+  private hint(): string {
+    const { drawing, image } = this.sheets.current!
+    if (drawing.annotated.length > 0) return T.draw.oneMore
+    return image ? T.draw.onImage(image.name) : T.draw.onEmpty
   }
 
   /** Send what is drawn now; what was sent before and is not answered yet is given up. */
@@ -128,7 +196,7 @@ export class DrawView {
     const planes = drawing.annotated
     if (planes.length < FEWEST_PLANES || !drawing.labels.some((label) => label > 0)) {
       this.clearSurface()
-      this.status.say(planes.length === 0 ? T.draw.onEmpty : T.draw.oneMore)
+      this.status.say(this.hint())
       return
     }
     const began = performance.now()
@@ -137,7 +205,7 @@ export class DrawView {
       const mask = new File([writeNifti(drawing.grid, drawing.labels)], 'drawing.nii')
       const form = formOf([mask], { model: this.model.value }, planes)
       const summary = await this.api.reconstruct(form, signal)
-      await this.showSurface(summary, signal)
+      await this.showSurface(summary, drawing, signal)
       mark(this.element, performance.now() - began)
       this.status.say(T.draw.done(planes.length, (performance.now() - began) / 1000))
       this.keepOnly(summary)
@@ -147,20 +215,20 @@ export class DrawView {
     }
   }
 
-  private async showSurface(summary: Summary, signal: AbortSignal): Promise<void> {
+  private async showSurface(summary: Summary, drawing: Drawing, signal: AbortSignal): Promise<void> {
     const surface = readMz3(await this.api.bytes(resultPath(summary.id, '/mesh?format=mz3&space=RAS'), signal))
     const scale = surface.scalars && scaleFromZero(surface.scalars)
     const look = this.look.begin(scale && { name: T.figures.sdShort, label: T.figures.sdLegend, unit: 'mm', scale }, false)
     await this.surface.show(surface, look)
-    this.placed = placed(surface, this.drawing!.grid)
+    this.placed = placed(surface, drawing.grid)
     for (const pane of this.canvases) pane.draw()
     this.look.element.hidden = false
-    replace(this.told, ...this.findings(summary))
+    replace(this.told, ...this.findings(summary, drawing))
   }
 
-  /** Only the latest result of a drawing is worth keeping. */
+  /** Only the latest result of a drawing is worth keeping, and those that somebody asked for. */
   private keepOnly(summary: Summary): void {
-    if (this.shown) {
+    if (this.shown && !isKept(this.shown)) {
       dismiss(this.shown)
       this.api.forget(this.shown).catch(() => undefined)
     }
@@ -168,11 +236,13 @@ export class DrawView {
     remember({ id: summary.id, label: T.draw.label(summary.model.name, new Date(summary.created)) })
   }
 
-  private findings(summary: Summary): HTMLElement[] {
-    const link = h('a', { href: `#/result/${summary.id}` }, T.draw.open)
+  private findings(summary: Summary, drawing: Drawing): HTMLElement[] {
+    const link = h('a', { href: `#/${resultPlace(summary.id)}` }, T.draw.open)
+    for (const event of TAKING) link.addEventListener(event, () => keep(summary.id))
+    const sent = { stacks: [{ ...drawing.grid, part: 'mask[0]' }], files: [] }
     return [
       h('p', { class: 'finding' }, T.draw.finding(summary)),
-      ...summary.warnings.map((text) => h('p', { class: 'warning' }, text)),
+      ...warningsInWords(summary, sent).map((text) => h('p', { class: 'warning' }, text)),
       h('p', {}, link),
     ]
   }
@@ -193,44 +263,7 @@ export class DrawView {
   }
 
   private setup(): HTMLElement {
-    const image = h('input', { type: 'file', accept: '.nii,.nii.gz,.gz' })
-    image.addEventListener('change', () => void this.begin(image.files?.[0] ?? null))
-    const empty = (): void => {
-      image.value = ''
-      void this.begin(null)
-    }
-    return h('div', { class: 'request' }, field(T.request.model, this.model), field(T.draw.image, image, T.draw.imageHint), button(T.draw.clear, empty))
-  }
-
-  private tools(): HTMLElement {
-    const kinds = (['polygon', 'brush'] as const).map((kind) => this.toolChoice(kind))
-    const erase = h('input', { type: 'checkbox' })
-    erase.addEventListener('change', () => (this.tool.erase = erase.checked))
-    erase.dataset['tool'] = 'erase'
-    const size = slider(0.5, 8, 2, (value) => (this.tool.radiusMm = value), 0.5)
-    return h(
-      'fieldset',
-      { class: 'tools' },
-      h('legend', {}, T.draw.tools),
-      h('div', { class: 'row' }, ...kinds),
-      h('label', { class: 'check' }, erase, T.draw.erase),
-      field(T.draw.radius, size),
-      h('div', { class: 'row' }, this.undo, this.redo),
-    )
-  }
-
-  private toolChoice(kind: Tool['kind']): HTMLElement {
-    const radio = h('input', { type: 'radio', name: 'tool', value: kind, checked: kind === this.tool.kind })
-    radio.addEventListener('change', () => (this.tool.kind = kind))
-    return h('label', { class: 'check' }, radio, T.draw.kinds[kind])
-  }
-
-  private key(event: KeyboardEvent): void {
-    const typing = event.target instanceof HTMLInputElement && event.target.type === 'text'
-    if (typing || !(event.ctrlKey || event.metaKey)) return
-    if (event.key.toLowerCase() === 'z') this.step(event.shiftKey ? 'redo' : 'undo')
-    else if (event.key.toLowerCase() === 'y') this.step('redo')
-    else return
-    event.preventDefault()
+    const empty = button(T.draw.clear, () => void this.begin(null))
+    return h('div', { class: 'request' }, field(T.request.model, this.model), field(T.draw.image, this.image, T.draw.imageHint), empty)
   }
 }

@@ -1,10 +1,12 @@
 /** Two results beside each other, each coloured by how far it lies outside (or inside) the other. */
 
-import { type Api, resultPath } from '../api'
+import { type Api, resultPath, sentence } from '../api'
 import { legend, scaleAroundZero } from '../colour'
 import { button, field, h, option, replace, unique } from '../dom'
 import { type Surface, readMz3 } from '../mesh'
-import { knownResults } from '../results'
+import { keep, knownResults } from '../results'
+import { decoded } from '../route'
+import { Status } from '../status'
 import { T } from '../text'
 import { PLAIN_LOOK, SurfaceView } from '../viewer'
 
@@ -15,17 +17,15 @@ export class Compare {
   private readonly views = [new SurfaceView(T.compare.first), new SurfaceView(T.compare.second)] as const
   private readonly pair = h('div', { class: 'pair', hidden: true })
   private readonly legendPlace = h('div', { class: 'legend-place still' })
-  private readonly told = h('p', { class: 'finding', role: 'status' })
+  private readonly status = new Status()
   private linked = false
 
-  constructor(
-    private readonly api: Api,
-    private readonly fail: (fault: unknown) => void,
-  ) {
+  constructor(private readonly api: Api) {
+    this.status.element.classList.add('finding')
     const run = button(T.compare.run, () => void this.run(), { class: 'primary' })
     const controls = h('div', { class: 'row' }, field(T.compare.first, this.first.element), field(T.compare.second, this.second.element), run)
     replace(this.pair, ...this.views.map((view, n) => h('figure', {}, view.element, h('figcaption', {}, n === 0 ? T.compare.first : T.compare.second))))
-    replace(this.element, h('h2', {}, T.compare.title), h('p', { class: 'hint' }, T.compare.how), controls, this.told, this.legendPlace, this.pair)
+    replace(this.element, h('h2', {}, T.compare.title), h('p', { class: 'hint' }, T.compare.how), controls, this.status.element, this.legendPlace, this.pair)
     this.refresh()
   }
 
@@ -42,16 +42,16 @@ export class Compare {
   private async run(): Promise<void> {
     const [a, b] = [identifier(this.first.element.value), identifier(this.second.element.value)]
     if (!a || !b) {
-      this.told.textContent = T.compare.needTwo
+      this.status.fail(T.compare.needTwo)
       return
     }
+    for (const id of [a, b]) keep(id)
     try {
-      this.told.textContent = T.compare.working
+      this.status.say(T.compare.working)
       const surfaces = await Promise.all([this.fetch(a, b), this.fetch(b, a)])
       await this.show(surfaces)
     } catch (fault) {
-      this.told.textContent = ''
-      this.fail(fault)
+      this.status.fail(sentence(fault))
     }
   }
 
@@ -64,7 +64,7 @@ export class Compare {
     this.linked = true
     replace(this.legendPlace, legend(scale, T.compare.legend, 'mm'))
     const mean = both.reduce((sum, value) => sum + Math.abs(value), 0) / both.length
-    this.told.textContent = T.compare.finding(mean, both.reduce((a, b) => Math.max(a, Math.abs(b)), 0))
+    this.status.say(T.compare.finding(mean, both.reduce((a, b) => Math.max(a, Math.abs(b)), 0)))
   }
 
   private async fetch(id: string, other: string): Promise<Surface> {
@@ -81,5 +81,5 @@ function choice(): { element: HTMLInputElement; list: HTMLDataListElement } {
 
 /** The identifier in a link or on its own. */
 function identifier(text: string): string {
-  return decodeURIComponent(text.trim().replace(/^.*\/result\//, ''))
+  return decoded(text.trim().replace(/^.*\/result\//, ''))
 }

@@ -2,8 +2,8 @@
 
 import { type Api, isAbort } from '../api'
 import { button, field, h, replace } from '../dom'
-import { slider } from '../look'
 import { frame, readMz3 } from '../mesh'
+import { moveTo, slider, sliderField } from '../slider'
 import { T } from '../text'
 import type { ModelDescription } from '../types'
 import { PLAIN_LOOK, SurfaceView } from '../viewer'
@@ -31,11 +31,11 @@ export class Gallery {
   ) {
     this.seed.value = query.get('seed') ?? '0'
     this.temperature = slider(0.2, 2, Number(query.get('temperature') ?? 1), () => undefined, 0.1)
-    for (const control of [this.seed, this.temperature]) control.addEventListener('change', () => void this.draw())
+    for (const control of [this.seed, this.temperature]) control.addEventListener('change', () => this.redraw())
     this.painter.element.classList.add('offscreen')
     this.painter.element.setAttribute('aria-hidden', 'true')
     this.painter.element.inert = true
-    const controls = h('div', { class: 'row' }, field(T.gallery.seed, this.seed), field(T.gallery.temperature, this.temperature), button(T.gallery.more, () => this.more()))
+    const controls = h('div', { class: 'row' }, field(T.gallery.seed, this.seed), sliderField(T.gallery.temperature, this.temperature, T.plainNumber), button(T.gallery.more, () => this.more()))
     replace(this.element, h('h2', {}, T.gallery.title), h('p', { class: 'hint' }, T.gallery.how), controls, this.grid, this.told, this.painter.element)
   }
 
@@ -48,9 +48,23 @@ export class Gallery {
     await this.draw()
   }
 
+  /** Take seed and variety from an address; false where it asks for nothing else than what is shown. */
+  take(query: URLSearchParams): boolean {
+    const { seed, temperature } = { ...this.query(), ...Object.fromEntries(query) }
+    const differs = seed !== this.seed.value || temperature !== this.temperature.value
+    this.seed.value = seed!
+    moveTo(this.temperature, temperature!)
+    return differs
+  }
+
+  /** Begin again with what seed and variety say now. */
+  redraw(): void {
+    if (this.model) void this.draw()
+  }
+
   private more(): void {
     this.seed.value = String((Number(this.seed.value) + COUNT) % LARGEST_SEED)
-    void this.draw()
+    this.redraw()
   }
 
   private async draw(): Promise<void> {
@@ -70,7 +84,9 @@ export class Gallery {
       await Promise.all(Array.from({ length: LANES }, lane))
       this.told.textContent = T.gallery.done(COUNT)
     } catch (fault) {
-      if (!isAbort(fault)) this.fail(fault)
+      if (isAbort(fault)) return
+      this.told.textContent = ''
+      this.fail(fault)
     }
   }
 

@@ -3,8 +3,8 @@
 import { type Api, isAbort } from '../api'
 import { type Scale, legend, scaleAroundZero } from '../colour'
 import { button, h, mark, replace } from '../dom'
-import { slider } from '../look'
 import { frame, readMz3 } from '../mesh'
+import { moveTo, slider, valueOf } from '../slider'
 import { T } from '../text'
 import type { Mode, ModelDescription } from '../types'
 import { PLAIN_LOOK, SurfaceView } from '../viewer'
@@ -38,35 +38,26 @@ export class Modes {
     replace(this.element, side, h('div', { class: 'stage' }, this.view.element, this.legendPlace))
   }
 
-  async show(model: ModelDescription): Promise<void> {
+  async show(model: ModelDescription, signal: AbortSignal): Promise<void> {
+    const modes = await this.api.modes(model.name, signal)
+    signal.throwIfAborted()
     this.model = model
-    const modes = await this.api.modes(model.name)
+    this.scale = scaleAroundZero(new Float32Array([1]))
     this.sliders.replaceChildren(...modes.slice(0, SHOWN).map((mode) => this.slider(mode)))
     await this.begin()
   }
 
   private async begin(): Promise<void> {
     this.coordinates.clear()
-    for (const input of this.sliders.querySelectorAll('input')) {
-      input.value = '0'
-      input.dispatchEvent(new Event('told'))
-    }
+    for (const input of this.sliders.querySelectorAll('input')) moveTo(input, '0')
     this.told.textContent = ''
     await this.fetch(1)
   }
 
   private slider(mode: Mode): HTMLElement {
-    const place = h('output', {}, T.modes.sd(0))
     const input = slider(-FARTHEST_SD, FARTHEST_SD, 0, (value) => this.move(mode.rank, value), 0.1)
     const id = (input.id = `mode-${mode.rank}`)
-    const tell = (): void => {
-      place.textContent = T.modes.sd(Number(input.value))
-      input.setAttribute('aria-valuetext', T.modes.sd(Number(input.value)))
-    }
-    input.addEventListener('input', tell)
-    input.addEventListener('told', tell)
-    tell()
-    return h('div', { class: 'mode' }, h('label', { for: id }, T.modes.mode(mode.rank, mode.variance_explained)), input, place)
+    return h('div', { class: 'mode' }, h('label', { for: id }, T.modes.mode(mode.rank, mode.variance_explained)), input, valueOf(input, T.modes.sd))
   }
 
   private move(rank: number, sd: number): void {

@@ -1,12 +1,11 @@
 /** Sampled shapes, modes as sliders, and two results beside each other. */
 
-import { type Api, sentence } from '../api'
+import { type Api, isAbort, sentence } from '../api'
 import { field, h, replace } from '../dom'
-import { modelOptions } from '../models'
+import { loadedModels, modelOptions } from '../models'
 import { rewrite } from '../route'
 import { Status } from '../status'
 import { T } from '../text'
-import type { ModelDescription } from '../types'
 import { Compare } from './compare'
 import { Gallery } from './gallery'
 import { Modes } from './modes'
@@ -18,8 +17,11 @@ export class ExploreView {
   private readonly modes: Modes
   private readonly gallery: Gallery
   private readonly compare: Compare
-  private readonly wanted: string | null
-  private readonly fail = (fault: unknown): void => this.status.fail(sentence(fault))
+  private wanted: string | null
+  private choosing = new AbortController()
+  private readonly fail = (fault: unknown): void => {
+    if (!isAbort(fault)) this.status.fail(sentence(fault))
+  }
 
   constructor(
     private readonly api: Api,
@@ -27,7 +29,7 @@ export class ExploreView {
   ) {
     this.modes = new Modes(api, this.fail)
     this.gallery = new Gallery(api, query, this.fail, () => this.remember())
-    this.compare = new Compare(api, this.fail)
+    this.compare = new Compare(api)
     this.wanted = query.get('model')
     this.model.addEventListener('change', () => void this.choose())
     const head = h('div', { class: 'row explore-head' }, h('h1', {}, T.explore.title), field(T.request.model, this.model))
@@ -36,29 +38,46 @@ export class ExploreView {
 
   async start(): Promise<void> {
     try {
-      const models = await this.api.models()
+      const models = await loadedModels(this.api, this.fail)
       replace(this.model, ...modelOptions(models, this.wanted))
       await this.choose()
     } catch (fault) {
-      this.status.fail(sentence(fault))
+      this.fail(fault)
     }
   }
 
-  /** Called whenever the view is turned to: other views may have made results meanwhile. */
-  refresh(): void {
+  /** Called whenever the view is turned to: the address may ask for another shape, other views may have made results. */
+  refresh(query: URLSearchParams): void {
     this.compare.refresh()
-    this.remember()
+    const differs = this.gallery.take(query)
+    this.wanted = query.get('model') ?? this.wanted
+    if (this.take(query.get('model'))) void this.choose()
+    else if (differs) this.gallery.redraw()
+    else this.remember()
   }
 
+  /** Whether another model is chosen now. */
+  private take(model: string | null): boolean {
+    const known = [...this.model.options].some((one) => one.value === model)
+    if (!model || !known || model === this.model.value) return false
+    this.model.value = model
+    return true
+  }
+
+  /** What was chosen before and has not arrived yet is given up. */
   private async choose(): Promise<void> {
+    this.choosing.abort()
+    this.choosing = new AbortController()
+    const { signal } = this.choosing
     try {
-      const model: ModelDescription = await this.api.model(this.model.value)
       this.remember()
+      const model = await this.api.model(this.model.value, signal)
       this.status.say('')
-      await this.modes.show(model).catch(this.fail)
+      await this.modes.show(model, signal).catch(this.fail)
+      signal.throwIfAborted()
       await this.gallery.show(model)
     } catch (fault) {
-      this.status.fail(sentence(fault))
+      this.fail(fault)
     }
   }
 

@@ -3,6 +3,7 @@
 import { figure } from '../colour'
 import { h } from '../dom'
 import { planeName } from '../grid'
+import { type Sent, warningsInWords } from '../places'
 import { T } from '../text'
 import type { Estimate, Grid, Summary } from '../types'
 
@@ -26,13 +27,13 @@ export function figures(summary: Summary): HTMLElement {
   )
 }
 
-export function warnings(summary: Summary): HTMLElement | null {
-  const sentences = [...summary.warnings, ...(summary.fit.converged ? [] : [T.figures.notConverged(summary.fit.message)])]
+export function warnings(summary: Summary, sent: Sent): HTMLElement {
+  const sentences = [...warningsInWords(summary, sent), ...(summary.fit.converged ? [] : [T.figures.notConverged(summary.fit.message)])]
   if (sentences.length === 0) return h('p', { class: 'fine' }, T.figures.noWarnings)
   return h(
     'section',
     { class: 'warnings', 'aria-label': T.figures.warnings },
-    h('h3', {}, T.figures.warnings),
+    h('h2', {}, T.figures.warnings),
     h('ul', {}, ...sentences.map((text) => h('li', {}, text))),
   )
 }

@@ -2,7 +2,7 @@
 
 import type { Api } from '../api'
 import { button, field, h, option, replace } from '../dom'
-import { EXAMPLE_MODEL, modelOptions } from '../models'
+import { EXAMPLE_MODEL, loadedModels, modelOptions } from '../models'
 import { T } from '../text'
 
 export const EXAMPLE = 'page/example_hippocampus.nii.gz'
@@ -31,9 +31,8 @@ export class RequestForm {
     this.tellFiles()
   }
 
-  async loadModels(): Promise<void> {
-    const models = await this.api.models()
-    replace(this.model, ...modelOptions(models))
+  async loadModels(wait: (fault: unknown) => void): Promise<void> {
+    replace(this.model, ...modelOptions(await loadedModels(this.api, wait)))
   }
 
   get modelName(): string {

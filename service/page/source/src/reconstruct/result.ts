@@ -29,7 +29,7 @@ export class ResultPanel {
   }
 
   /** The surface first; slices follow once it is on the screen. */
-  async show(summary: Summary, drawn: DrawnPlanes | null, signal: AbortSignal): Promise<void> {
+  async show(summary: Summary, drawn: DrawnPlanes | null, files: string[], signal: AbortSignal): Promise<void> {
     const surface = readMz3(await this.api.bytes(resultPath(summary.id, '/mesh?format=mz3&space=RAS'), signal))
     const colouring: Colouring | null = surface.scalars && {
       name: T.figures.sdShort,
@@ -42,7 +42,7 @@ export class ResultPanel {
     replace(
       this.element,
       figures(summary),
-      warnings(summary),
+      warnings(summary, { stacks: drawn?.stacks ?? null, files }),
       this.slices.element,
       residuals(summary, drawn?.stacks ?? null),
       this.keeping(summary),
@@ -82,14 +82,23 @@ export class ResultPanel {
     const address = h('input', { type: 'text', readonly: true, value: resultLink(summary.id) })
     const told = h('p', { role: 'status', class: 'hint' }, T.link.until(new Date(summary.expires)))
     const copy = async (): Promise<void> => {
-      address.select()
-      await navigator.clipboard.writeText(address.value).catch(() => undefined)
-      told.textContent = T.link.copied
+      told.textContent = (await copied(address)) ? T.link.copied : T.link.selected
     }
     return h('div', { class: 'downloads' }, field(T.link.title, address), button(T.link.copy, () => void copy()), told)
   }
 
   private origin(summary: Summary): HTMLElement {
     return h('p', { class: 'hint' }, T.madeBy(summary.model.name, summary.model.version, summary.observations, summary.fit.iterations))
+  }
+}
+
+/** Whether the text of a field was copied. Browsers have the newer way only where the page came by HTTPS or from here. */
+async function copied(field: HTMLInputElement): Promise<boolean> {
+  field.select()
+  try {
+    await navigator.clipboard.writeText(field.value)
+    return true
+  } catch {
+    return document.execCommand('copy')
   }
 }

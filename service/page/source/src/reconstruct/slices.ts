@@ -42,9 +42,8 @@ export class ResultSlices {
       uncertain ? fetchVolume(`/uncertainty?${query}`) : null,
     ])
     const over = edges(labels, query === '' ? drawn : null)
-    const object = labels.values.reduce<number[]>((found, value, n) => (value > 0 ? [...pushed(found, n)] : found), [])
     const paint = (): Paint => painter(labels, entropy, this.layer.value as Layer)
-    this.sections.show(labels, paint(), over, middleOf(labels, object))
+    this.sections.show(labels, paint(), over, middleOf(labels, inside(labels)))
     this.layer.disabled = entropy === null
     this.layer.onchange = () => this.sections.repaint(paint(), over)
     replace(this.legendPlace, entropy && legend(ENTROPY, T.slices.entropyLegend, 'nat'), h('p', { class: 'hint' }, T.slices.hint))
@@ -72,7 +71,7 @@ function edges(labels: Volume, drawn: DrawnPlanes | null): Over {
   }
 }
 
-function pushed(list: number[], value: number): number[] {
-  list.push(value)
-  return list
+/** Numbers of the object's voxels. */
+function* inside(labels: Volume): Generator<number> {
+  for (let voxel = 0; voxel < labels.values.length; voxel += 1) if (labels.values[voxel]! > 0) yield voxel
 }

@@ -3,8 +3,8 @@
 import { type Api, Refusal, formOf, isAbort, sentence } from '../api'
 import { button, h, replace } from '../dom'
 import { planeSurface } from '../drawn'
-import { remember } from '../results'
-import { rewrite } from '../route'
+import { keep, remember } from '../results'
+import { resultPlace, rewrite } from '../route'
 import { Status } from '../status'
 import { T } from '../text'
 import type { DrawnPlanes, Summary } from '../types'
@@ -24,12 +24,11 @@ export class ReconstructView {
   private readonly stage = h('div', { class: 'stage offscreen' })
   private readonly below = h('div', { class: 'below' })
   private readonly welcome: HTMLElement
-  private drawn: DrawnPlanes | null = null
   private reading = new AbortController()
   private working = new AbortController()
   private shown: string | null = null
   private sending = false
-  private planesRead: Promise<void> = Promise.resolve()
+  private planesRead: Promise<DrawnPlanes | null> = Promise.resolve(null)
 
   constructor(private readonly api: Api) {
     this.form = new RequestForm(api, () => (this.planesRead = this.readPlanes()))
@@ -45,20 +44,32 @@ export class ReconstructView {
   }
 
   async start(): Promise<void> {
-    await this.guarded(() => this.form.loadModels())
+    void this.loadModels()
     await this.surface.start()
+  }
+
+  /** Called whenever the view is turned to without a result: the address is that of what is shown. */
+  refresh(): void {
+    if (!this.element.hidden) rewrite(this.shown ? resultPlace(this.shown) : '')
   }
 
   /** A result that was made before, by its link. */
   async open(id: string): Promise<void> {
+    keep(id)
     if (this.shown === id) return
-    this.working.abort()
-    this.working = new AbortController()
+    const [next, signal] = this.begin([T.steps.summary, T.steps.surface])
+    this.endSending()
     await this.guarded(async () => {
-      const next = this.status.wait([T.steps.summary, T.steps.surface], () => this.working.abort())
-      const summary = await this.api.summary(id)
+      const summary = await this.api.summary(id, signal)
       next(1)
-      await this.showResult(summary, null)
+      await this.showResult(summary, null, [], signal)
+    })
+  }
+
+  private async loadModels(): Promise<void> {
+    await this.guarded(async () => {
+      await this.form.loadModels((fault) => this.status.fail(sentence(fault)))
+      this.status.recover()
     })
   }
 
@@ -73,24 +84,36 @@ export class ReconstructView {
     })
   }
 
-  private async readPlanes(): Promise<void> {
+  /** Which planes count as looked at; null where that is not known. */
+  private async readPlanes(): Promise<DrawnPlanes | null> {
     this.reading.abort()
     this.reading = new AbortController()
     const { signal } = this.reading
-    this.drawn = null
-    this.send.disabled = this.form.files.length === 0
-    if (this.form.files.length === 0) return
+    const { files } = this.form
+    if (!this.sending) this.clear()
+    if (files.length === 0) return null
+    let drawn: DrawnPlanes | null = null
     await this.guarded(async () => {
       if (!this.sending) this.status.say(T.steps.reading)
-      const drawn = await this.api.planes(formOf(this.form.files, this.form.planeChoices()), signal)
-      this.drawn = drawn
+      drawn = await this.api.planes(formOf(files, this.form.planeChoices()), signal)
       if (!this.sending) await this.showPreview(drawn)
     })
+    return drawn
+  }
+
+  /** Nothing tells of files that are no longer chosen; a result stays until there is something else to show. */
+  private clear(): void {
+    this.status.say('')
+    this.send.disabled = this.form.files.length === 0
+    if (this.shown) return
+    replace(this.below)
+    void this.surface.show(null, PLAIN_LOOK)
+    if (this.form.files.length === 0) this.closeStage()
   }
 
   private async showPreview(drawn: DrawnPlanes): Promise<void> {
     this.shown = null
-    rewrite('')
+    this.refresh()
     this.openStage()
     this.result.look.element.hidden = true
     replace(this.result.look.legend)
@@ -101,31 +124,44 @@ export class ReconstructView {
   }
 
   private async reconstruct(): Promise<void> {
-    this.working.abort()
-    this.working = new AbortController()
-    const { signal } = this.working
     const form = formOf(this.form.files, this.form.allChoices())
-    const steps = [this.form.slow ? T.steps.fitSlow : T.steps.fit, T.steps.surface]
-    const next = this.status.wait(steps, () => this.working.abort())
+    const files = this.form.files.map((file) => file.name)
+    const [next, signal] = this.begin([this.form.slow ? T.steps.fitSlow : T.steps.fit, T.steps.surface])
     this.send.disabled = this.sending = true
     await this.guarded(async () => {
-      const [summary] = await Promise.all([this.api.reconstruct(form, signal), this.planesRead])
+      const [summary, drawn] = await Promise.all([this.api.reconstruct(form, signal), this.planesRead])
       next(1)
       remember({ id: summary.id, label: T.result.label(summary.model.name, new Date(summary.created)) })
-      await this.showResult(summary, this.drawn)
-      rewrite(`result/${summary.id}`)
+      await this.showResult(summary, drawn, files, signal)
+      this.refresh()
     })
-    this.send.disabled = this.sending = false
+    if (signal === this.working.signal) this.endSending()
   }
 
-  private async showResult(summary: Summary, drawn: DrawnPlanes | null): Promise<void> {
+  /** Give up what is under way, and tell the steps of something new, which can be cancelled. */
+  private begin(steps: string[]): [(step: number) => void, AbortSignal] {
+    this.working.abort()
+    this.working = new AbortController()
+    const cancel = (): void => {
+      this.working.abort()
+      this.status.say(T.cancelled)
+    }
+    return [this.status.wait(steps, cancel), this.working.signal]
+  }
+
+  private endSending(): void {
+    this.sending = false
+    this.send.disabled = this.form.files.length === 0
+  }
+
+  private async showResult(summary: Summary, drawn: DrawnPlanes | null, files: string[], signal: AbortSignal): Promise<void> {
     this.openStage()
-    await this.result.show(summary, drawn, this.working.signal)
+    await this.result.show(summary, drawn, files, signal)
     this.shown = summary.id
+    keep(summary.id)
     this.result.look.element.hidden = false
     replace(this.below, this.result.element)
     this.status.say(T.result.ready)
-    this.element.dispatchEvent(new CustomEvent('result', { detail: summary.id }))
   }
 
   private openStage(): void {
@@ -133,12 +169,17 @@ export class ReconstructView {
     this.stage.classList.remove('offscreen')
   }
 
+  private closeStage(): void {
+    this.welcome.hidden = false
+    this.stage.classList.add('offscreen')
+  }
+
   private async guarded(work: () => Promise<void>): Promise<void> {
     try {
       await work()
     } catch (fault) {
-      if (isAbort(fault)) this.status.say(T.cancelled)
-      else if (fault instanceof Refusal && fault.status === 404 && this.shown === null) this.status.fail(T.link.gone)
+      if (isAbort(fault)) return
+      if (fault instanceof Refusal && fault.status === 404 && this.shown === null) this.status.fail(T.link.gone)
       else this.status.fail(sentence(fault))
     }
   }

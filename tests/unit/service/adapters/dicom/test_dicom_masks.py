@@ -102,7 +102,9 @@ def test_a_label_is_a_segment_number(kind):
     for label, part in ((None, values), (frozenset({1}), values & left), (frozenset({2}), values & ~left)):
         (stack,) = stacks_of_object(found, "mask[0]", LIMITS, label, grid)
         assert (stack.foreground == part).all()
-    with pytest.raises(InvalidMask, match="segments that are there: 1, 2"):
+    with pytest.raises(InvalidMask, match="no segment 3, 7; segments that are there: 1, 2"):
+        stacks_of_object(found, "mask[0]", LIMITS, frozenset({1, 3, 7}))
+    with pytest.raises(InvalidMask, match="no segment 3; segments that are there: 1, 2"):
         stacks_of_object(found, "mask[0]", LIMITS, frozenset({3}))
 
 

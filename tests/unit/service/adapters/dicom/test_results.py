@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import highdicom as hd
@@ -194,3 +195,72 @@ def test_multi_frame_images_are_a_series_as_well(tmp_path):
         assert [error for found in results.values() for error in checker_errors(file_bytes(found), tmp_path)] == []
     (stack,) = stacks_of_object(reread(results["segmentation"]), "mask[0]", LIMITS, home=derivation.series.grid)
     assert (stack.foreground == (probability >= 0.5)).all()
+
+
+def test_one_structure_of_several_is_told_by_its_number_and_name(derived):
+    derivation, probability = derived
+    images = mr_series()
+    drawn, _ = sparse_ellipsoid(shape=derivation.series.grid.shape)
+    both = reread(seg_of(images, np.stack([drawn, drawn], -1), labels=("left", "right")))
+    right = replace(derivation, drawing=both, labels=frozenset({2}))
+    results = {name: reread(found) for name, found in result_objects(right, probability).items()}
+    assert all("#2 (" in text for found in results.values() for text in descriptions_of(found))
+    assert results["segmentation"].SegmentSequence[0].SegmentLabel == "right"
+    assert results["surface"].SegmentSequence[0].SegmentLabel == "right"
+    assert (
+        hd.sr.Comprehensive3DSR.from_dataset(results["report"])
+        .content.get_volumetric_roi_measurement_groups()[0]
+        .tracking_identifier
+        == "right"
+    )
+
+
+@pytest.mark.parametrize("labels", [None, frozenset({1})])
+def test_the_only_structure_is_called_as_the_model_is(labels, derived):
+    assert replace(derived[0], labels=labels).label == "ellipsoid"
+    assert "#" not in replace(derived[0], labels=labels).description("Surface")
+
+
+@pytest.mark.parametrize("number", [1, 999, 1000, 65535])
+def test_descriptions_with_a_number_fit_where_the_object_is_cut(number, derived):
+    short = replace(derived[0], series=series_of(list(derived[0].series.images[:8])))
+    several = reread(derived[0].drawing)
+    several.SegmentSequence.append(reread(derived[0].drawing).SegmentSequence[0])
+    several.SegmentSequence[1].SegmentNumber = 0
+    several.SegmentSequence[0].SegmentNumber = number
+    cut = replace(short, drawing=several, labels=frozenset({number}))
+    assert cut.is_cut
+    assert len(cut.description("Uncertainty maps")) <= 64
+
+
+@pytest.mark.parametrize("offset", ["+0530", "-0800", ""])
+def test_all_results_are_of_one_moment_in_the_time_zone_of_the_images(offset, derived):
+    images = [reread(found) for found in mr_series()]
+    for image in images:
+        if offset:
+            image.TimezoneOffsetFromUTC = offset
+    zone = datetime.strptime(offset, "%z").tzinfo if offset else None
+    before = datetime.now(zone)
+    results = result_objects(replace(derived[0], series=series_of(images)), derived[1]).values()
+    after = datetime.now(zone)
+    moments = {
+        (found.InstanceCreationDate, found.InstanceCreationTime, found.ContentDate, found.ContentTime)
+        for found in map(reread, results)
+    }
+    ((created_on, created_at, made_on, made_at),) = moments
+    assert (created_on, created_at) == (made_on, made_at)
+    assert before <= datetime.strptime(f"{made_on}{made_at}", "%Y%m%d%H%M%S.%f").replace(tzinfo=zone) <= after
+    assert {found.get("TimezoneOffsetFromUTC", "") for found in results} == {offset}
+
+
+def test_a_drawing_of_another_study_is_referred_to_as_such(derived, tmp_path):
+    elsewhere = reread(derived[0].drawing)
+    elsewhere.StudyInstanceUID = generate_uid()
+    results = result_objects(replace(derived[0], drawing=elsewhere), derived[1])
+    for name in ("stl", "surface"):
+        (study,) = results[name].StudiesContainingOtherReferencedInstancesSequence
+        assert study.StudyInstanceUID == elsewhere.StudyInstanceUID
+        assert study.ReferencedSeriesSequence[0].SeriesInstanceUID == elsewhere.SeriesInstanceUID
+        assert len(results[name].ReferencedSeriesSequence) == 1
+        if shutil.which("dciodvfy") is not None:
+            assert checker_errors(file_bytes(results[name]), tmp_path) == []

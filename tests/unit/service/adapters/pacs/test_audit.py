@@ -3,6 +3,8 @@
 import json
 from multiprocessing import get_context
 
+import pytest
+
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome, broken_line
 
 
@@ -40,6 +42,22 @@ def test_a_whole_trail_is_whole_and_a_changed_one_is_not(tmp_path):
     ):
         path.write_bytes(b"".join(broken))
         assert broken_line(path) == expected
+
+
+@pytest.mark.parametrize("kept", [0, 2])
+def test_what_was_torn_spoils_no_later_line(tmp_path, kept):
+    path = tmp_path / "audit.jsonl"
+    write(path, kept)
+    whole = path.read_bytes() if kept else b""
+    write(path, 1)
+    torn = path.read_bytes()[len(whole) : -20]
+    path.write_bytes(whole + torn)
+    write(path, 2)
+    lines = path.read_bytes().splitlines(keepends=True)
+    assert lines[kept] == torn + b"\n"
+    assert broken_line(path) == kept + 1
+    path.write_bytes(b"".join([*lines[:kept], *lines[kept + 1 :]]))
+    assert broken_line(path) is None
 
 
 def test_processes_write_in_turn(tmp_path):

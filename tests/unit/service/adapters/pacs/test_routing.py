@@ -6,8 +6,8 @@ import pytest
 from model.errors import InvalidMask, InvalidParameter
 from service.adapters.dicom.masks import referenced_series
 from service.adapters.pacs.configuration import Rule, load_configuration
-from service.adapters.pacs.routing import find_rule
-from tests.dicom_parts import mr_series, reread, ring, rtstruct_of, seg_of
+from service.adapters.pacs.routing import MOST_STRUCTURES, find_rule
+from tests.dicom_parts import mr_series, reread, ring, rtstruct_of, seg_of, with_region
 
 SIZE = (12, 10, 8)
 
@@ -29,19 +29,67 @@ def rule(**conditions) -> Rule:
 
 
 @pytest.mark.parametrize(
-    ("conditions", "labels"),
+    ("conditions", "structures"),
     [
-        ({}, None),
-        ({"segment_labels": ("*HIPPOCAMPUS",)}, {1}),
-        ({"segment_labels": ("tum?ur", "none")}, {2}),
-        ({"segment_codes": ("SCT:5366008",)}, {1, 2}),
-        ({"segment_codes": ("SCT:5366008",), "segment_labels": ("left*",), "senders": ("VIEWER",)}, {1}),
+        ({}, [{1}, {2}]),
+        ({"segment_labels": ("*HIPPOCAMPUS",)}, [{1}]),
+        ({"segment_labels": ("tum?ur", "none")}, [{2}]),
+        ({"segment_codes": ("SCT:5366008",)}, [{1}, {2}]),
+        ({"segment_codes": ("SCT:5366008",), "segment_labels": ("left*",), "senders": ("VIEWER",)}, [{1}]),
     ],
 )
-def test_conditions_that_hold(drawing, conditions, labels):
+def test_conditions_that_hold(drawing, conditions, structures):
     match = find_rule([rule(**conditions)], drawing, "VIEWER")
     assert match is not None
-    assert match.labels == (None if labels is None else frozenset(labels))
+    assert list(match.structures) == structures
+
+
+@pytest.mark.parametrize(("conditions", "expected"), [({}, None), ({"segment_labels": ("hippo*",)}, {1})])
+def test_a_drawing_of_one_structure_stays_whole(images, conditions, expected):
+    drawn = np.zeros(SIZE, np.uint8)
+    drawn[3:6, 3:6, 3:6] = 1
+    match = find_rule([rule(**conditions)], reread(seg_of(images, drawn)), "VIEWER")
+    assert match is not None
+    assert match.structures == (expected,)
+
+
+def test_segments_that_draw_nothing_are_no_structures(images):
+    both = np.zeros((*SIZE, 2), np.uint8)
+    both[7:9, 3:6, 3:6, 1] = 1
+    found = reread(seg_of(images, both, labels=("left", "right")))
+    match = find_rule([rule(segment_codes=("SCT:5366008",))], found, "VIEWER")
+    assert match is not None
+    assert match.structures == ({2},)
+
+
+def test_the_background_of_a_label_map_is_no_structure(images):
+    both = np.zeros((*SIZE, 2), np.uint8)
+    both[3:6, 3:6, 3:6, 0] = both[7:9, 3:6, 3:6, 1] = 1
+    found = reread(seg_of(images, both, "LABELMAP", labels=("left", "right")))
+    match = find_rule([rule()], found, "VIEWER")
+    assert match is not None
+    assert match.structures == ({1}, {2})
+
+
+def test_regions_are_structures_too(images):
+    left, right, empty = (rtstruct_of(images, contours_at(images, places)) for places in ((2, 3), (4,), ()))
+    found = with_region(with_region(left, right, 7), empty, 9)
+    match = find_rule([rule(segment_labels=("hippo*",))], found, "VIEWER")
+    assert match is not None
+    assert match.structures == ({1}, {7})
+
+
+def contours_at(images, places):
+    return [("CLOSED_PLANAR", ring(images, place, (2.0,))[0]) for place in places]
+
+
+def test_more_structures_than_anybody_draws_are_refused(images):
+    found = rtstruct_of(images, contours_at(images, (3,)))
+    one = reread(found)
+    for number in range(2, MOST_STRUCTURES + 2):
+        found = with_region(found, one, number)
+    with pytest.raises(InvalidMask, match=f"{MOST_STRUCTURES + 1} segments or regions"):
+        find_rule([rule()], found, "VIEWER")
 
 
 @pytest.mark.parametrize(
@@ -75,7 +123,7 @@ def test_regions_of_structure_sets_are_segments(images):
     found = rtstruct_of(images, [("CLOSED_PLANAR", ring(images, 3, (2.0,))[0])])
     match = find_rule([rule(segment_labels=("hippo*",))], found, "VIEWER")
     assert match is not None
-    assert match.labels == {1}
+    assert match.structures == ({1},)
     assert referenced_series(found) == images[0].SeriesInstanceUID
 
 

@@ -1,0 +1,188 @@
+"""From files to a result on the page: it tells of what is there now, and of nothing else."""
+
+import json
+from itertools import pairwise
+
+import nibabel as nib
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+
+from benchmarks.browser import drag_ellipse
+from benchmarks.server import serving
+from tests.page_parts import patient_browser, reconstruct, take_example, visiting
+
+pytestmark = pytest.mark.slow
+EXAMPLE = "docs/examples/hippocampus_three_slices.nii.gz"
+#: Voxels (0.5 mm) of the half axes of an ellipsoid of the size of a talus.
+HALF_AXES = (50, 36, 34)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with patient_browser() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def address(shipped_bundles, browser):  # noqa: ARG001 - no service where nobody can visit it
+    with serving(()) as server:
+        yield str(server.client.base_url)
+
+
+@pytest.fixture
+def visit(browser, address):
+    with visiting(browser, address) as opened:
+        yield opened
+
+
+@pytest.fixture
+def large(tmp_path):
+    """Three planes of an object of a quarter of a million voxels."""
+    shape = [2 * half + 9 for half in HALF_AXES]
+    away = np.stack(np.meshgrid(*[np.arange(size) - size // 2 for size in shape], indexing="ij"), axis=-1)
+    inside = ((away / HALF_AXES) ** 2).sum(axis=-1) <= 1.0
+    drawn = np.where((away == 0).any(axis=-1), inside, False).astype(np.uint8)
+    file = tmp_path / "large.nii.gz"
+    nib.save(nib.Nifti1Image(drawn, np.diag([0.5, 0.5, 0.5, 1.0])), file)
+    return file
+
+
+def status(visit):
+    return visit.shown(".status").inner_text().strip()
+
+
+def choose(visit, *files):
+    visit.page.get_by_label("Choose mask files").set_input_files(files)
+
+
+def test_sections_of_a_large_object_are_shown(visit, large):
+    visit.go()
+    visit.page.get_by_label("Model", exact=True).select_option("talus")
+    visit.page.get_by_label("Uncertainty", exact=True).select_option("none")
+    choose(visit, large)
+    expect(visit.page.get_by_text("annotated planes found")).to_be_visible()
+    reconstruct(visit)
+    expect(visit.shown(".slices [data-plane=axial] canvas")).to_be_visible()
+
+
+def test_nothing_tells_of_a_file_that_was_removed(visit):
+    take_example(visit)
+    visit.page.get_by_role("button", name="Remove hippocampus").click()
+    expect(visit.shown(".preview")).to_have_count(0)
+    assert status(visit) == ""
+    expect(visit.shown(".welcome")).to_be_visible()
+
+
+def test_files_that_arrive_while_others_are_read_cancel_nothing(visit, repository):
+    visit.go()
+    held = []
+    visit.page.route("**/v1/planes", held.append)
+    for _ in range(2):
+        with visit.page.expect_request("**/v1/planes"):
+            choose(visit, repository / EXAMPLE)
+    expect(visit.page.get_by_text("Reading the masks")).to_be_visible()
+    expect(visit.page.get_by_text("Cancelled.")).to_be_hidden()
+    held[1].continue_()
+    expect(visit.page.get_by_text("annotated planes found")).to_be_visible()
+
+
+def test_the_address_is_that_of_the_result_when_the_view_is_turned_to_again(visit):
+    take_example(visit)
+    reconstruct(visit)
+    address = visit.page.url
+    assert "#/result/" in address
+    visit.page.get_by_role("link", name="Draw", exact=True).click()
+    visit.page.get_by_role("link", name="Reconstruct", exact=True).click()
+    expect(visit.page).to_have_url(address)
+    visit.page.reload()
+    expect(visit.shown(".figures")).to_be_visible()
+
+
+def test_looking_up_a_link_can_be_cancelled(visit):
+    take_example(visit)
+    reconstruct(visit)
+    visit.page.route("**/v1/reconstructions/*", lambda route: None)
+    with visit.page.expect_request("**/v1/reconstructions/*"):
+        visit.page.reload()
+    visit.page.get_by_role("button", name="Cancel").click()
+    expect(visit.page.get_by_text("Cancelled.")).to_be_visible()
+    expect(visit.page.get_by_role("button", name="Cancel")).to_be_hidden()
+
+
+def test_a_link_is_copied_where_the_browser_has_no_clipboard_for_it(visit):
+    take_example(visit)
+    reconstruct(visit)
+    visit.page.evaluate("Object.defineProperty(navigator, 'clipboard', { value: undefined })")
+    visit.page.get_by_role("button", name="Copy").click()
+    expect(visit.page.get_by_text("Copied.")).to_be_visible()
+    visit.page.evaluate("document.execCommand = () => false")
+    visit.page.get_by_role("button", name="Copy").click()
+    expect(visit.page.get_by_text("the link is selected")).to_be_visible()
+
+
+def test_a_link_to_nothing_is_told_in_a_sentence(browser, address):
+    with visiting(browser, address, expected="status of 404") as visit:
+        visit.go("#/result/%")
+        expect(visit.page.get_by_role("alert").filter(has_text="no longer kept")).to_be_visible()
+
+
+def told_instead(visit, **values):
+    """Let the service answer other values in a result's summary."""
+
+    def alter(route):
+        answer = route.fetch()
+        route.fulfill(response=answer, body=json.dumps({**answer.json(), **values}))
+
+    visit.page.route("**/v1/reconstructions", alter)
+
+
+def test_planes_in_warnings_are_named_as_the_page_shows_them(visit):
+    told_instead(visit, warnings=["The drawing on mask[0] axis 2 index 14 disagrees; check it."], planes=[])
+    take_example(visit)
+    reconstruct(visit)
+    expect(visit.shown(".warnings")).to_contain_text("The drawing on axial slice 15 of 34 disagrees")
+
+
+def test_of_several_files_a_warning_names_the_one_it_means(visit, repository):
+    planes = [{"stack": stack, "axis": 2, "index": 14} for stack in (0, 1)]
+    told_instead(visit, warnings=["The drawing on mask[1] axis 2 index 14 disagrees."], planes=planes)
+    visit.go()
+    choose(visit, repository / EXAMPLE, repository / EXAMPLE)
+    expect(visit.page.get_by_text("6 annotated planes found")).to_be_visible()
+    reconstruct(visit)
+    expect(visit.shown(".warnings")).to_contain_text("axial slice 15 of 34 of hippocampus_three_slices.nii.gz")
+
+
+@pytest.mark.parametrize(("percentile", "words"), [(0.05, "unlike anything"), (0.6, "rarer than 99 in 100")])
+def test_typicality_is_called_unlike_the_model_where_the_service_warns(visit, percentile, words):
+    told_instead(visit, typicality_percentile=percentile)
+    take_example(visit)
+    reconstruct(visit)
+    expect(visit.shown(".figures")).to_contain_text(words)
+
+
+def test_models_are_listed_once_the_service_answers(browser, address):
+    with visiting(browser, address, expected="ERR_FAILED") as visit:
+        visit.page.route("**/v1/models", lambda route: route.abort())
+        visit.go()
+        expect(visit.page.get_by_role("alert").filter(has_text="does not answer")).to_be_visible()
+        visit.page.unroute("**/v1/models")
+        expect(visit.page.get_by_label("Model", exact=True).locator("option")).to_have_count(3)
+        expect(visit.page.get_by_role("alert").filter(has_text="does not answer")).to_be_hidden()
+
+
+def test_headings_skip_no_level(visit):
+    take_example(visit)
+    reconstruct(visit)
+    drag = visit.page.get_by_role("link", name="Draw", exact=True)
+    levels = (
+        "[...document.querySelectorAll('h1, h2, h3, h4')].filter((e) => e.checkVisibility()).map((e) => +e.tagName[1])"
+    )
+    for part in ("Reconstruct", "Draw"):
+        if part == "Draw":
+            drag.click()
+            drag_ellipse(visit.page, "axial", 0.1, 0.2)
+        found = visit.page.evaluate(levels)
+        assert found[0] == 1
+        assert all(later - earlier <= 1 for earlier, later in pairwise(found))

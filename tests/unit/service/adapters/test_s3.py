@@ -1,0 +1,71 @@
+"""Storage that refuses is a failure of the medium, whatever the library calls it, and told without places."""
+
+import io
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+pytest.importorskip("boto3")
+
+from service.adapters.blob_results import BlobResultStore
+from service.adapters.s3 import S3Blobs
+from service.errors import StoreFull
+from tests.service_parts import outcome_of
+
+REFUSAL = b"<Error><Code>QuotaExceeded</Code><Message>full</Message></Error>"
+
+
+class Refusing(BaseHTTPRequestHandler):
+    """Takes nothing."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self):
+        self.rfile.read(int(self.headers.get("Content-Length") or 0))
+        self.send_response(403)
+        self.send_header("Content-Length", str(len(REFUSAL)))
+        self.end_headers()
+        self.wfile.write(REFUSAL)
+
+    def do_PUT(self):
+        self.do_GET()
+
+    def do_POST(self):
+        self.do_GET()
+
+    def log_message(self, *_):
+        """Keep quiet."""
+
+
+@pytest.fixture
+def blobs(monkeypatch):
+    for name, value in (("ACCESS_KEY_ID", "a"), ("SECRET_ACCESS_KEY", "b"), ("DEFAULT_REGION", "us-east-1")):
+        monkeypatch.setenv(f"AWS_{name}", value)
+    with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield S3Blobs("s3://bucket/prefix", f"http://127.0.0.1:{server.server_port}")
+        server.shutdown()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda blobs: blobs.put("place", b"1"),
+        lambda blobs: blobs.put_file("place", io.BytesIO(b"1")),
+        lambda blobs: blobs.put_file("place", io.BytesIO(bytes(9 << 20))),
+        lambda blobs: blobs.get("place"),
+        lambda blobs: list(blobs.list("place/")),
+    ],
+    ids=["bytes", "file", "file in pieces", "get", "list"],
+)
+def test_a_refusal_is_a_failure_of_the_medium(blobs, call):
+    with pytest.raises(OSError, match="object storage refused") as caught:
+        call(blobs)
+    assert "place" not in str(caught.value)
+    assert "bucket" not in str(caught.value)
+
+
+def test_a_result_that_storage_refuses_is_one_for_later(blobs):
+    with pytest.raises(StoreFull):
+        BlobResultStore(blobs, lifetime_s=10.0).save(outcome_of())
