@@ -88,6 +88,18 @@ def take_example(visit: Visit) -> None:
     expect(visit.page.get_by_text("3 annotated planes found")).to_be_visible()
 
 
+def drop(visit: Visit, data: bytes, *names: str) -> None:
+    """Drop files of the same content onto the page."""
+    visit.page.locator(".drop").evaluate(
+        """(zone, [data, names]) => {
+            const dropped = new DataTransfer()
+            for (const name of names) dropped.items.add(new File([new Uint8Array(data)], name))
+            zone.dispatchEvent(new DragEvent('drop', { dataTransfer: dropped, bubbles: true, cancelable: true }))
+        }""",
+        [list(data), names],
+    )
+
+
 def reconstruct(visit: Visit) -> None:
     """Send what was chosen, and wait for the result."""
     visit.page.get_by_role("button", name="Reconstruct", exact=True).click()

@@ -14,7 +14,17 @@ from benchmarks.server import serving
 from service.app import create_app
 from service.settings import Settings
 from tests.dicom_parts import file_bytes, mr_series, seg_of
-from tests.page_parts import PHONE, overflow, patient_browser, picture, reconstruct, serious, take_example, visiting
+from tests.page_parts import (
+    PHONE,
+    drop,
+    overflow,
+    patient_browser,
+    picture,
+    reconstruct,
+    serious,
+    take_example,
+    visiting,
+)
 from tests.service_parts import behind_prefix, running
 
 pytestmark = pytest.mark.slow
@@ -130,15 +140,7 @@ def test_what_cannot_be_read_is_told_in_the_services_words(browser, address, tmp
 
 def test_a_dropped_file_is_taken(visit, repository):
     visit.go()
-    data = list((repository / EXAMPLE).read_bytes())
-    visit.page.locator(".drop").evaluate(
-        """(zone, data) => {
-            const dropped = new DataTransfer()
-            dropped.items.add(new File([new Uint8Array(data)], 'dropped.nii.gz'))
-            zone.dispatchEvent(new DragEvent('drop', { dataTransfer: dropped, bubbles: true, cancelable: true }))
-        }""",
-        data,
-    )
+    drop(visit, (repository / EXAMPLE).read_bytes(), "dropped.nii.gz")
     expect(visit.page.get_by_text("3 annotated planes found")).to_be_visible()
 
 

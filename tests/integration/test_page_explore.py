@@ -40,7 +40,7 @@ def test_the_model_that_was_chosen_last_is_shown_whichever_answers_last(browser,
     with visiting(browser, address) as visit:
         open_model(visit, "adrenal")
         held = []
-        visit.page.route("**/v1/models/hippocampus/modes", held.append)
+        visit.page.route("**/v1/models/hippocampus/modes", lambda route: held.append(route))
         choice = visit.shown(".explore-head select")
         with visit.page.expect_request("**/v1/models/hippocampus/modes"):
             choice.select_option("hippocampus")

@@ -2,6 +2,7 @@
 
 import { type Api, Refusal } from './api'
 import { option } from './dom'
+import type { Status } from './status'
 import { T } from './text'
 import type { ModelSummary } from './types'
 
@@ -11,14 +12,16 @@ export const EXAMPLE_MODEL = 'hippocampus'
 /** How long (ms) until a service that does not answer is asked again. */
 const AGAIN_MS = 2000
 
-/** The loaded models, once the service answers; `wait` is told each time that it does not. */
-export async function loadedModels(api: Api, wait: (fault: unknown) => void): Promise<ModelSummary[]> {
-  for (;;) {
+/** The loaded models, once the service answers; until then it is told that it does not. */
+export async function loadedModels(api: Api, status: Status): Promise<ModelSummary[]> {
+  for (let told = ''; ; ) {
     try {
-      return await api.models()
+      const models = await api.models()
+      status.recover(told)
+      return models
     } catch (fault) {
       if (!(fault instanceof Refusal && fault.isPassing)) throw fault
-      wait(fault)
+      status.fail((told = fault.message))
     }
     await new Promise((resolve) => setTimeout(resolve, AGAIN_MS))
   }

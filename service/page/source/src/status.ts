@@ -27,8 +27,8 @@ export class Status {
   }
 
   /** What went wrong is over; anything else that is said stays. */
-  recover(): void {
-    this.wrong.textContent = ''
+  recover(text: string): void {
+    if (this.wrong.textContent === text) this.wrong.textContent = ''
   }
 
   /** Steps with a bar and the time so far; `cancel` stops the work. */

@@ -68,9 +68,7 @@ export class DrawView {
 
   async start(): Promise<void> {
     try {
-      const models = await loadedModels(this.api, (fault) => this.status.fail(sentence(fault)))
-      this.status.recover()
-      replace(this.model, ...modelOptions(models))
+      replace(this.model, ...modelOptions(await loadedModels(this.api, this.status)))
       if (!this.sheets.current) await this.begin(null)
     } catch (fault) {
       this.status.fail(sentence(fault))

@@ -42,7 +42,7 @@ export class Compare {
   private async run(): Promise<void> {
     const [a, b] = [identifier(this.first.element.value), identifier(this.second.element.value)]
     if (!a || !b) {
-      this.status.fail(T.compare.needTwo)
+      this.fail(T.compare.needTwo)
       return
     }
     for (const id of [a, b]) keep(id)
@@ -51,8 +51,14 @@ export class Compare {
       const surfaces = await Promise.all([this.fetch(a, b), this.fetch(b, a)])
       await this.show(surfaces)
     } catch (fault) {
-      this.status.fail(sentence(fault))
+      this.fail(sentence(fault))
     }
+  }
+
+  /** Told below the button, and brought into sight. */
+  private fail(text: string): void {
+    this.status.fail(text)
+    this.status.element.scrollIntoView({ block: 'nearest' })
   }
 
   private async show(surfaces: [Surface, Surface]): Promise<void> {

@@ -38,7 +38,7 @@ export class ExploreView {
 
   async start(): Promise<void> {
     try {
-      const models = await loadedModels(this.api, this.fail)
+      const models = await loadedModels(this.api, this.status)
       replace(this.model, ...modelOptions(models, this.wanted))
       await this.choose()
     } catch (fault) {

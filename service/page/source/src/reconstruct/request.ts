@@ -3,6 +3,7 @@
 import type { Api } from '../api'
 import { button, field, h, option, replace } from '../dom'
 import { EXAMPLE_MODEL, loadedModels, modelOptions } from '../models'
+import type { Status } from '../status'
 import { T } from '../text'
 
 export const EXAMPLE = 'page/example_hippocampus.nii.gz'
@@ -31,8 +32,8 @@ export class RequestForm {
     this.tellFiles()
   }
 
-  async loadModels(wait: (fault: unknown) => void): Promise<void> {
-    replace(this.model, ...modelOptions(await loadedModels(this.api, wait)))
+  async loadModels(status: Status): Promise<void> {
+    replace(this.model, ...modelOptions(await loadedModels(this.api, status)))
   }
 
   get modelName(): string {

@@ -44,7 +44,7 @@ export class ReconstructView {
   }
 
   async start(): Promise<void> {
-    void this.loadModels()
+    void this.guarded(() => this.form.loadModels(this.status))
     await this.surface.start()
   }
 
@@ -63,13 +63,6 @@ export class ReconstructView {
       const summary = await this.api.summary(id, signal)
       next(1)
       await this.showResult(summary, null, [], signal)
-    })
-  }
-
-  private async loadModels(): Promise<void> {
-    await this.guarded(async () => {
-      await this.form.loadModels((fault) => this.status.fail(sentence(fault)))
-      this.status.recover()
     })
   }
 
