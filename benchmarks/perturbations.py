@@ -17,8 +17,8 @@ from model.bundle import ShapeModel, open_bundle
 from model.errors import InputError
 from model.geometry import Grid
 from model.inference.fitting import MirrorRule
+from model.inference.one_body import body_mask
 from model.inference.reconstruction import Options, reconstruct
-from model.inference.uncertainty import occupancy
 from training.cohort_options import DataOption
 from training.cohorts import Case, CohortName, CohortOptions, data_folder, load_cohort
 from training.console import exit_status
@@ -157,7 +157,7 @@ def measure(
     except InputError as error:
         return Outcome(np.inf, (str(error),))
     there = Grid(case.grid.shape, affine @ case.grid.affine)
-    filled = np.asarray(occupancy(model, answer.state, there) > 0.5)
+    filled = body_mask(model, answer.state, answer.mesh, there)
     return Outcome(agreement(case.mask, filled, there.spacing).asd_mm, answer.warnings)
 
 

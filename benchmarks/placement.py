@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from model.bundle import ShapeModel, open_bundle
 from model.geometry import Grid
 from model.inference.fitting import MirrorRule
+from model.inference.one_body import body_mask
 from model.inference.reconstruction import Options, reconstruct
-from model.inference.uncertainty import occupancy
 from training.cohort_options import DataOption
 from training.cohorts import Case, CohortName, CohortOptions, data_folder, load_cohort
 from training.console import exit_status
@@ -69,7 +69,7 @@ def measure(model: ShapeModel, case: Case, regime: Regime, placement: Placement)
     options = Options(annotated=drawing.planes, uncertainty="none", mirror=placement.mirror)
     found = reconstruct(model, [stack], options)
     there = Grid(case.grid.shape, placement.affine @ case.grid.affine)
-    return agreement(case.mask, occupancy(model, found.state, there) > 0.5, there.spacing)
+    return agreement(case.mask, body_mask(model, found.state, found.mesh, there), there.spacing)
 
 
 def main(

@@ -17,13 +17,13 @@ from model.inference.modes import ShapeModes, shape_along
 from model.inference.next_plane import Among, NextPlane
 from model.inference.next_plane import next_plane as best_plane
 from model.inference.observations import AnnotatedRule, MaskStack, Plane, find_planes
-from model.inference.one_body import OCCUPIED, of_one_body
+from model.inference.one_body import OCCUPIED, body_mask, body_probability
 from model.inference.posterior_shapes import PosteriorShape, draw_posterior
 from model.inference.reconstruction import SURFACE_SD, Options, Watch, unwatched
 from model.inference.reconstruction import reconstruct as infer
 from model.inference.sampling import SampledShape, draw_shape
 from model.inference.surface import covering_grid, require_step
-from model.inference.uncertainty import ShapeState, occupancy, voxel_entropy
+from model.inference.uncertainty import ShapeState, voxel_entropy
 from model.interruption import Check, interruptible, unchecked
 from service.errors import NotComputed
 from service.ports import Catalogue, ModeSource, Outcome
@@ -79,8 +79,8 @@ def probability_map(
     mesh = outcome.reconstruction.mesh
     grid = outcome.grid if spacing_mm is None else covering_grid(mesh, spacing_mm)
     require_voxels(grid, max_voxels)
-    probability = occupancy(model, outcome.reconstruction.state, grid)
-    return Volume(of_one_body(probability, grid, mesh).astype(np.float32), grid)
+    probability = body_probability(model, outcome.reconstruction.state, mesh, grid)
+    return Volume(probability.astype(np.float32), grid)
 
 
 def segmentation(
@@ -206,8 +206,7 @@ def label_map(model: ShapeModel, shape: SampledShape, spacing_mm: float, max_vox
     require_voxels(grid, max_voxels)
     size = len(shape.latent) + 7
     fit = Fit(shape.latent, Pose(), FitStatus.CONVERGED, "Drawn, not fitted.", 0, 0.0, np.zeros((size, size)))
-    probability = occupancy(model, ShapeState((fit,), None), grid)
-    return Volume((of_one_body(probability, grid, shape.mesh) >= OCCUPIED).astype(np.uint8), grid)
+    return Volume(body_mask(model, ShapeState((fit,), None), shape.mesh, grid).astype(np.uint8), grid)
 
 
 def modes_of(model: ShapeModel, modes: ModeSource, check: Check = unchecked) -> ShapeModes:

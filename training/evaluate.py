@@ -19,8 +19,8 @@ from jaxtyping import Bool
 from model.bundle import MANIFEST, Manifest, ShapeModel, open_bundle, read_manifest
 from model.errors import InputError, InvalidParameter, UnknownModel
 from model.geometry import Grid
+from model.inference.one_body import body_mask
 from model.inference.reconstruction import Options, reconstruct
-from model.inference.uncertainty import occupancy
 from training.baselines.contours import contour_fill
 from training.baselines.interpolation import signed_distance_interpolation
 from training.cohorts.cohort import Case
@@ -164,7 +164,7 @@ def fills_of(model: ShapeModel, seed: int) -> dict[Method, Fill]:
     def with_model(drawing: Drawing, grid: Grid) -> Bool[np.ndarray, "i j k"]:
         options = Options(annotated=drawing.planes, uncertainty="none", seed=seed)
         found = reconstruct(model, [drawing.stack], options)
-        return np.asarray(occupancy(model, found.state, grid) > 0.5)
+        return body_mask(model, found.state, found.mesh, grid)
 
     return {
         Method.MODEL: with_model,

@@ -50,11 +50,6 @@ def posterior_scale(sound: Sequence[Sound]) -> dict[str, float]:
     }
 
 
-def coverage(sound: Sequence[Sound], scale: float, offset_mm: float, level: float) -> float:
-    """Share of the answers whose interval of the volume holds the truth."""
-    return _coverage(_columns(sound), scale, offset_mm, level)
-
-
 def _coverage(columns: Columns, scale: float, offset_mm: float, level: float) -> float:
     error, sd, swelling = columns
     return float(np.mean(np.abs(error) <= interval_reach(level) * np.hypot(scale * sd, offset_mm * swelling)))

@@ -65,8 +65,8 @@ def make_fill(method: MethodName, sources: Sources) -> Fill:
 def project_fill(sources: Sources, choices: dict[str, float]) -> Fill:
     """The project through its public functions."""
     from model.bundle import open_bundle
+    from model.inference.one_body import body_mask
     from model.inference.reconstruction import reconstruct
-    from model.inference.uncertainty import occupancy
 
     model = open_bundle(sources.bundle, threads=sources.threads)
 
@@ -78,7 +78,7 @@ def project_fill(sources: Sources, choices: dict[str, float]) -> Fill:
             stages[stage] = time.perf_counter() - begin
 
         found = reconstruct(model, drawing.stacks, options, watch)
-        return Filled(np.asarray(occupancy(model, found.state, grid) > 0.5), stages.get("surface"))
+        return Filled(body_mask(model, found.state, found.mesh, grid), stages.get("surface"))
 
     return fill
 

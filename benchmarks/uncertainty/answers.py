@@ -17,8 +17,9 @@ from model.bundle import ShapeModel
 from model.inference.estimates import estimate_of
 from model.inference.member_moves import member_moves
 from model.inference.mesh import Mesh, vertex_areas, volume_ml
+from model.inference.one_body import body_probability
 from model.inference.reconstruction import Options, Reconstruction, UncertaintyRule, reconstruct
-from model.inference.uncertainty import ShapeState, occupancy, surface_spread
+from model.inference.uncertainty import ShapeState, surface_spread
 from training.calibration import near_surface
 from training.cohorts.cohort import Case
 from training.sparsify import Drawing, Regime, for_evaluation
@@ -79,7 +80,7 @@ def _volume(model: ShapeModel, answer: Reconstruction, case: Case) -> Payload:
 def _voxels(model: ShapeModel, answer: Reconstruction, case: Case) -> Payload:
     """Reliability of voxels within 5 mm of the true surface, in bins of equal width."""
     near = near_surface(case.mask, case.grid.spacing)
-    probability = occupancy(model, answer.state, case.grid)[near].astype(float)
+    probability = body_probability(model, answer.state, answer.mesh, case.grid)[near].astype(float)
     return reliability(probability, case.mask[near])
 
 

@@ -11,8 +11,8 @@ from model.bundle import ShapeModel
 from model.errors import InputError
 from model.inference.mask_stack import MaskStack, Plane
 from model.inference.next_plane import next_plane
+from model.inference.one_body import body_mask
 from model.inference.reconstruction import Options, Reconstruction, reconstruct
-from model.inference.uncertainty import occupancy
 from training.cohorts.cohort import Case
 from training.metrics_masks import agreement
 
@@ -32,7 +32,7 @@ def measure_next_planes(model: ShapeModel, case: Case, advised: bool, run: int) 
     for count in range(FIRST, LAST + 1):
         stack = MaskStack("mask[0]", case.grid, case.mask, np.zeros(case.mask.shape, bool))
         answer = reconstruct(model, [stack], Options(annotated=tuple(planes)))
-        found = occupancy(model, replace(answer.state, covariance=None), case.grid) >= 0.5
+        found = body_mask(model, replace(answer.state, covariance=None), answer.mesh, case.grid)
         distances.append(agreement(case.mask, found, case.grid.spacing).asd_mm)
         if count < LAST:
             chosen = _advised(model, case, answer, planes) if advised else None

@@ -8,13 +8,15 @@ answer says so.
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import cKDTree
 
+from model.bundle import ShapeModel
 from model.geometry import Grid
 from model.inference.mesh import Mesh
 from model.inference.observations import Observations
+from model.inference.uncertainty import ShapeState, occupancy
 
 #: A voxel belongs to the object from this probability on.
 OCCUPIED = 0.5
@@ -22,6 +24,20 @@ OCCUPIED = 0.5
 APART_MM = 3.0
 #: The largest share of what was drawn that may lie apart without a warning.
 APART_SHARE = 0.1
+
+
+def body_probability(model: ShapeModel, state: ShapeState, mesh: Mesh, grid: Grid) -> Float[np.ndarray, "i j k"]:
+    """Posterior mean occupancy probability at the voxel centres of a grid, of the surface's body alone.
+
+    Args:
+        mesh: the surface of the same state (world mm).
+    """
+    return of_one_body(occupancy(model, state, grid), grid, mesh)
+
+
+def body_mask(model: ShapeModel, state: ShapeState, mesh: Mesh, grid: Grid) -> Bool[np.ndarray, "i j k"]:
+    """The voxels of a grid that more likely than not belong to the surface's body."""
+    return body_probability(model, state, mesh, grid) >= OCCUPIED
 
 
 def of_one_body(probability: Float[np.ndarray, "i j k"], grid: Grid, mesh: Mesh) -> Float[np.ndarray, "i j k"]:

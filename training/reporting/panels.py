@@ -11,10 +11,11 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from model.bundle import ShapeModel
+from model.inference.one_body import body_probability
 from model.inference.reconstruction import SURFACE_SD, Options, reconstruct
 from model.inference.sampling import draw_shape
 from model.inference.surface import canonical_box, covering_grid
-from model.inference.uncertainty import occupancy, voxel_entropy
+from model.inference.uncertainty import voxel_entropy
 from training.cohorts.cohort import Case
 from training.config import Regime
 from training.rendering import STEPS, TRUTH_COLOUR, Surface, axes_around, show, surface_error, truth_surface
@@ -119,7 +120,7 @@ def uncertainty(model: ShapeModel, case: Case, regime: Regime) -> bytes:
     axes.set_title("on the surface", fontsize=9)
     _bar(figure, axes, scale, "magma", "SD (mm)")
     grid = covering_grid(answer.mesh, max(1.0, _step(model) / 2.0))
-    entropy = voxel_entropy(occupancy(model, answer.state, grid))
+    entropy = voxel_entropy(body_probability(model, answer.state, answer.mesh, grid))
     truth = case.grid.to_index(grid.centres())
     inside = _looked_up(case, truth).reshape(grid.shape)
     right, front, up = body_axes(grid)
