@@ -96,7 +96,7 @@ def create_app(
         title=TITLE,
         version=INTERFACE_VERSION,
         description=DESCRIPTION,
-        lifespan=partial(_lifespan, services=services, pacs=pacs, sweep=store.sweep, close=(jobs.close, engine.close)),
+        lifespan=partial(lifespan, services=services, pacs=pacs, sweep=store.sweep, close=(jobs.close, engine.close)),
     )
     app.state.services = services
     app.state.pacs = pacs
@@ -120,6 +120,7 @@ def _open_pacs(services: Services) -> AbstractContextManager[object]:
     pacs = open_pacs(services.settings, services.settings.pacs_file, services.blobs, services.jobs, services.log)
     services.metrics.watch("morphoflow_dicom_backlog", "Accepted drawings not given back yet", pacs.inbox.backlog)
     services.metrics.watch("morphoflow_dicom_quarantined", "Objects in quarantine", pacs.inbox.quarantined)
+    services.metrics.watch("morphoflow_dicom_turned_away", "Associations beyond the limit", pacs.turned_away.count)
     return pacs
 
 
@@ -185,7 +186,7 @@ def _drop_foreign_errors(document: dict[str, Any]) -> None:
 
 
 @asynccontextmanager
-async def _lifespan(
+async def lifespan(
     _: FastAPI,
     *,
     services: Services,
@@ -193,6 +194,14 @@ async def _lifespan(
     sweep: Callable[[], int],
     close: Iterable[Callable[[], None]],
 ) -> AsyncIterator[None]:
+    """The service while it runs; at its end all is closed, whatever becomes of one part.
+
+    Args:
+        services: the wired parts.
+        pacs: what stands among archives.
+        sweep: removes expired results, and tells how many.
+        close: closes what was opened, the last one first.
+    """
     _tell_models("started", services)
     async with AsyncExitStack() as leaving:
         leaving.callback(services.log.info, "stopped")

@@ -4,9 +4,8 @@ Exit status: 0 done, 2 the input is at fault (one sentence on standard error), 1
 """
 
 import signal
-import socket
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-import uvicorn
 import yaml
 from threadpoolctl import threadpool_limits
 
@@ -23,13 +21,14 @@ from service.adapters.processes import spread
 from service.app import create_app, interface_document
 from service.commands import OpenRegistry, models, reconstruct, sample
 from service.console import writing
-from service.dicom_commands import audit, deidentify
+from service.dicom_commands import audit, deidentify, resend
 from service.extras import install_line, require_extras
 from service.job_commands import jobs_commands
 from service.jobs.worker import run_worker, supervised_workers
 from service.mode_commands import modes
 from service.model_registry import ModelRegistry, load_registry
 from service.observability import Log, log_everything
+from service.serving import Server
 from service.settings import Settings, load_settings, require_protection
 from service.stores import require_places
 from service.wiring import program_version
@@ -38,10 +37,6 @@ PROGRAM = "morphoflow"
 #: Packages that bring further commands register a callable that takes the typer application.
 COMMAND_GROUP = "morphoflow.commands"
 BAD_INPUT, FAULT = 2, 1
-#: An idle connection stays open so long (s): longer than at a load balancer, which would send into a closing one.
-KEEP_ALIVE_S = 75
-#: Requests that run when the server is told to end have so long (s) to be answered.
-DRAIN_S = 30
 
 VersionOption = Annotated[bool, typer.Option("--version", help="Print the version.")]
 
@@ -84,7 +79,7 @@ def build_app() -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback(invoke_without_command=True)(_program)
-    for command in (serve, worker, reconstruct, sample, models, modes, deidentify, audit, openapi):
+    for command in (serve, worker, reconstruct, sample, models, modes, deidentify, audit, resend, openapi):
         app.command()(command)
     app.add_typer(jobs_commands(), name="jobs")
     return app
@@ -129,34 +124,10 @@ def serve(
         spread(settings.workers - 1, partial(_models_of_helper, helping), log) as compute,
         supervised_workers(settings.job_workers, log) as end_workers,
     ):
-        config = uvicorn.Config(
-            create_app(settings, registry=registry, compute=compute, log=log),
-            host=settings.host,
-            port=settings.port,
-            root_path=settings.root_path,
-            access_log=False,
-            log_config=None,
-            server_header=False,
-            timeout_graceful_shutdown=DRAIN_S,
-            timeout_keep_alive=KEEP_ALIVE_S,
-        )
-        _run(_Server(config, end_workers))
+        _run(Server(create_app(settings, registry=registry, compute=compute, log=log), end_workers))
 
 
-class _Server(uvicorn.Server):
-    """A server that lets others begin to leave when it does, and not when it has left."""
-
-    def __init__(self, config: uvicorn.Config, leave: Callable[[], None]) -> None:
-        super().__init__(config)
-        self._leave = leave
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Answer what was begun, for `DRAIN_S` at most."""
-        self._leave()
-        await super().shutdown(sockets)
-
-
-def _run(server: uvicorn.Server) -> None:
+def _run(server: Server) -> None:
     with suppress(KeyboardInterrupt):  # that is how a server ends that is told to from the keyboard
         server.run()
     if not server.started:

@@ -1,5 +1,6 @@
-"""The commands ``deidentify`` and ``audit``."""
+"""The commands ``deidentify``, ``audit`` and ``resend``."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,10 +13,14 @@ from service.adapters.nifti import write_nifti
 from service.commands import JsonOption
 from service.console import echo_json, writing
 from service.extras import require_extra
+from service.observability import make_log
 from service.settings import load_settings
+from service.stores import open_blobs, open_jobs
+from service.wiring import image_limits
 
 if TYPE_CHECKING:
     from service.adapters.dicom.deidentification import LeftOut
+    from service.adapters.pacs.inbox import Inbox
 
 
 class LeftOutFile(BaseModel):
@@ -46,7 +51,7 @@ def deidentify(
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InvalidParameter("--output names a folder that is not empty; an empty one is accepted.", part="--output")
     settings = load_settings()
-    limits = ImageLimits(max_bytes=settings.max_body_bytes, max_voxels=settings.max_voxels)
+    limits = image_limits(settings)
     with writing("--output"):
         done = _deidentify(study, output, limits)
     for name, left_out in (("not used", done.unused_files), ("no label map", done.unused_drawings)):
@@ -107,11 +112,60 @@ def audit(
     file: Annotated[Path, typer.Argument(help="Audit trail (JSON lines).")],
 ) -> None:
     """Check that no line of an audit trail was changed, removed or put in between."""
-    from service.adapters.pacs.audit import broken_line
+    from service.adapters.pacs.audit import check_trail
 
     if not file.is_file():
         raise InvalidParameter("The audit trail must be a file; there is none of this name.", part="file")
-    number = broken_line(file)
-    if number is not None:
-        raise InvalidParameter(f"The audit trail is broken at line {number}.", part="file")
+    found = check_trail(file)
+    if found.torn:
+        typer.echo(f"Torn off when a process ended: line {', '.join(map(str, found.torn))}.", err=True)
+    if found.broken is not None:
+        raise InvalidParameter(f"The audit trail is broken at line {found.broken}.", part="file")
     typer.echo("The audit trail is whole.")
+
+
+class Resent(BaseModel):
+    """What became of drawings in quarantine."""
+
+    taken: list[str] = Field(description="Folders in quarantine whose drawings are worked on again.")
+    left: list[str] = Field(description="Folders whose objects no rule takes, or that cannot be read; they stay.")
+
+
+def resend(
+    names: Annotated[list[str] | None, typer.Argument(help="Folders in quarantine; all when left out.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Take drawings in quarantine up again, so that archives are sent the results that they lack."""
+    require_extra("pacs", needed_by="morphoflow resend")
+    from service.pacs import open_pacs
+
+    settings = load_settings()
+    if settings.pacs_file is None:
+        raise InvalidParameter("MORPHOFLOW_PACS_FILE must name the file of rules.", part="pacs_file")
+    log = make_log("error")
+    with closing(open_jobs(settings)) as jobs:
+        done = _resend(open_pacs(settings, settings.pacs_file, open_blobs(settings), jobs, log).inbox, names)
+    echo_json(done) if as_json else typer.echo(f"{len(done.taken)} drawings taken up again, {len(done.left)} left.")
+
+
+def _resend(inbox: "Inbox", names: list[str] | None) -> Resent:
+    there = inbox.in_quarantine()
+    unknown = sorted(set(names or ()) - set(there))
+    if unknown:
+        raise InvalidParameter(
+            f"The quarantine has no folder {unknown[0]}; names of folders in it are accepted.", part="NAME"
+        )
+    done = Resent(taken=[], left=[])
+    for name in sorted(set(names)) if names else there:
+        (done.taken if _is_taken(inbox, name) else done.left).append(name)
+    return done
+
+
+def _is_taken(inbox: "Inbox", name: str) -> bool:
+    """Send one again; it is gone where another structure of the same object was sent again before."""
+    from service.pacs_ports import Disposition
+
+    try:
+        return inbox.send_again(name) is Disposition.ACCEPTED
+    except FileNotFoundError:
+        return True

@@ -32,7 +32,7 @@ from service.observability import make_log
 from service.ports import RECONSTRUCTIONS_JOB, SAMPLES_JOB, MeshFormat, SampleFormat
 from service.request_schemas import parse_annotated, parse_labels
 from service.settings import Settings, load_settings
-from service.stores import open_blobs, open_jobs
+from service.stores import open_blobs, open_jobs, require_jobs, require_places
 
 #: How often (s) a job is looked at.
 _POLL_S = 0.5
@@ -132,13 +132,16 @@ def watch_job(identifier: IdArgument, output: ResultOption = None, force: ForceO
     """Follow a job to its end; --output writes what it made."""
     require_free({"--output": output}, force=force)
     settings = load_settings()
+    require_jobs(settings)
     with closing(open_jobs(settings)) as jobs:
         _finish(jobs, open_blobs(settings), jobs.status(identifier), output, as_json=False)
 
 
 def cancel_job(identifier: IdArgument, as_json: JsonOption = False) -> None:
     """Stop a job."""
-    with closing(open_jobs(load_settings())) as jobs:
+    settings = load_settings()
+    require_jobs(settings)
+    with closing(open_jobs(settings)) as jobs:
         _tell(jobs.cancel(identifier), as_json=as_json)
 
 
@@ -147,6 +150,7 @@ Job = tuple[str, dict[str, Any], tuple[BinaryIO, ...]]
 
 
 def _begin(settings: Settings, job: Job, model: str, key: str | None, output: Path | None, *, as_json: bool) -> None:
+    require_places(settings)
     blobs = open_blobs(settings)
     with closing(open_jobs(settings)) as jobs:
         status = JobDesk(jobs, blobs, settings.max_jobs).submit(*job, key, model=model)

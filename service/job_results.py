@@ -3,24 +3,46 @@
 import json
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from model.inference.plausibility import counted
+from service.errors import Overloaded, UnknownResult
 from service.job_files import JobFiles
 from service.ports import SAMPLES_JOB
 
 MANIFEST = "manifest.json"
+#: What is said of a job whose result was deleted or has expired before it.
+RESULT_GONE = "The job's result has expired or been deleted."
 
 
 def result_members(job: JobFiles, kind: str, count: int) -> Iterator[tuple[str, bytes]]:
-    """Names and contents, one item in memory at a time."""
+    """Names and contents, one item in memory at a time.
+
+    Raises:
+        UnknownResult: they are not there any more.
+        Overloaded: the storage does not give them now.
+    """
     entries = []
     for number in range(count):
-        contents, entry = job.item(number)
+        with _reading():
+            contents, entry = job.item(number)
         entries.append(entry)
         yield from contents.items()
-    manifest = {**job.note("manifest"), **(counts_of(entries) if kind == SAMPLES_JOB else {}), kind: entries}
+    with _reading():
+        note = job.note("manifest")
+    manifest = {**note, **(counts_of(entries) if kind == SAMPLES_JOB else {}), kind: entries}
     yield MANIFEST, json.dumps(manifest, indent=1).encode()
+
+
+@contextmanager
+def _reading() -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise UnknownResult(RESULT_GONE) from None
+    except OSError as fault:
+        raise Overloaded("What the job has made cannot be read now; ask for it again later.") from fault
 
 
 def counts_of(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import hashlib
 import json
 import uuid
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -55,22 +56,35 @@ class JobDesk:
         Raises:
             InvalidParameter: the key has made a job for another request.
             Overloaded: as many jobs wait or run as may.
-            StoreFull: the inputs cannot be kept.
+            StoreFull: the inputs, or the job, cannot be kept; nothing is left of them.
         """
-        fingerprint = _fingerprint(asked, inputs)
-        identifier = self.jobs.new_id(kind, key)
-        found = self._found(identifier) if key is not None else None
-        if found is not None:
-            return _of_same_request(found, fingerprint)
+        if (earlier := self.earlier(kind, asked, inputs, key)) is not None:
+            return earlier
+        fingerprint, identifier = _fingerprint(asked, inputs), self.jobs.new_id(kind, key)
         if self.jobs.unfinished() >= self.max_jobs:
             raise Overloaded("As many jobs wait as this service accepts; send the request again later.")
         submission = "" if key is None else uuid.uuid4().hex
         self._keep(identifier, inputs, submission)
         argument = {**asked, "model": model, _FINGERPRINT: fingerprint, SUBMISSION: submission}
-        made = self.jobs.enqueue(kind, argument, identifier)
+        try:
+            made = self.jobs.enqueue(kind, argument, identifier)
+        except StoreFull:  # there is no job; of other faults that is not known
+            self._let_go(identifier, submission)
+            raise
         if made.argument.get(SUBMISSION, "") != submission:  # another request of the same key was faster
-            JobFiles(self.blobs, identifier).remove_inputs(submission)
+            self._let_go(identifier, submission)
         return _of_same_request(made, fingerprint)
+
+    def earlier(
+        self, kind: str, asked: Mapping[str, Any], inputs: Sequence[BinaryIO] = (), key: str | None = None
+    ) -> JobStatus | None:
+        """The job that the same key has made for the same request, whatever could be made of it now; None without one.
+
+        Raises:
+            InvalidParameter: the key has made a job for another request.
+        """
+        found = None if key is None else self._found(self.jobs.new_id(kind, key))
+        return None if found is None else _of_same_request(found, _fingerprint(asked, inputs))
 
     def _found(self, identifier: str) -> JobStatus | None:
         try:
@@ -84,8 +98,12 @@ class JobDesk:
             for number, file in enumerate(inputs):
                 files.put_input(number, file, submission)
         except OSError as fault:
-            files.remove_inputs(submission)
+            self._let_go(identifier, submission)
             raise StoreFull("What was sent cannot be kept now; send the request again later.") from fault
+
+    def _let_go(self, identifier: str, submission: str) -> None:
+        with suppress(OSError):  # of a storage that is away; what stays is found to be astray later
+            JobFiles(self.blobs, identifier).remove_inputs(submission)
 
 
 def require_stacks(annotated: AnnotatedRule | Sequence[Plane], count: int) -> None:

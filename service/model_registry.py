@@ -28,6 +28,11 @@ class BrokenModel:
     name: str
     reason: str
 
+    def __post_init__(self) -> None:
+        """Make both text that can be sent: names of folders may hold bytes that are no letters."""
+        for part in ("name", "reason"):
+            object.__setattr__(self, part, getattr(self, part).encode("utf-8", "replace").decode())
+
 
 class ModelRegistry:
     """The `Catalogue` of models in memory.
@@ -145,6 +150,7 @@ class OpenedOnce:
         manifest = folder / MANIFEST
         content = manifest.read_bytes() if manifest.is_file() else b""
         if folder not in self._opened or self._opened[folder][0] != content:
+            self._opened.pop(folder, None)  # one that cannot be opened any more takes no memory
             self._opened[folder] = content, self._open(folder)
         return self._opened[folder][1]
 

@@ -4,6 +4,7 @@ import logging
 import warnings
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Lock
 
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail
 from service.adapters.pacs.configuration import PacsConfiguration, load_configuration
@@ -19,15 +20,34 @@ TALKATIVE = ("pydicom", "pynetdicom", "highdicom", "dicomweb_client", "urllib3")
 PROGRAM = "MORPHOFLOW"
 
 
+class Tally:
+    """A count that several threads add to."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._count = 0
+
+    def add(self) -> None:
+        """One more."""
+        with self._lock:
+            self._count += 1
+
+    def count(self) -> int:
+        """How many there were."""
+        return self._count
+
+
 class Pacs:
     """The parts of the web process; while the context lasts, associations are accepted if the file asks for it.
 
     Attributes:
         inbox: takes objects.
+        turned_away: how many associations were one too many.
     """
 
     def __init__(self, configuration: PacsConfiguration, inbox: Inbox, log: Log) -> None:
         self.inbox = inbox
+        self.turned_away = Tally()
         self._listener = configuration.listener
         self._log = log
         self._scope = ExitStack()
@@ -38,7 +58,8 @@ class Pacs:
         inbox.audit.write(AuditEntry(AuditEvent.STARTED, inbox.title, inbox.title))
         self._scope.callback(inbox.audit.write, AuditEntry(AuditEvent.STOPPED, inbox.title, inbox.title))
         if self._listener is not None:
-            self._scope.enter_context(dimse_listener(self._listener, inbox, inbox.blobs, inbox.audit, self._log))
+            places = (inbox, inbox.blobs, inbox.audit)
+            self._scope.enter_context(dimse_listener(self._listener, *places, self._log, self.turned_away.add))
         return self
 
     def __exit__(self, *_: object) -> None:

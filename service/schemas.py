@@ -200,7 +200,7 @@ class ModelList(BaseModel):
 
 
 class ActiveDimensions(BaseModel):
-    """How many latent dimensions explain so much of the variance of the flow's base, that of the codes."""
+    """How many dimensions of the flow's base, largest first, hold so much of the variance of the base."""
 
     percent_95: int
     percent_97: int

@@ -172,7 +172,7 @@ def _is_database(url: str) -> bool:
         place = make_url(url)
     except (ArgumentError, ValueError):
         return False
-    return place.get_backend_name() in DATABASES and bool(place.database)
+    return place.get_backend_name() in DATABASES and place.database not in (None, "", ":memory:")
 
 
 def _is_http_address(url: str) -> bool:

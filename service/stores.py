@@ -11,12 +11,16 @@ from model.errors import InvalidParameter
 from service.adapters.blob_results import BlobResultStore
 from service.adapters.blobs import FolderBlobs
 from service.adapters.jobs.client import DbosJobs
-from service.adapters.jobs.database import is_postgres, open_engine
+from service.adapters.jobs.database import is_made, is_postgres, open_engine
 from service.adapters.result_store import DiskResultStore
+from service.errors import UnknownJob
 from service.extras import require_extra
 from service.job_ports import BlobStore
 from service.observability import Log
 from service.settings import Settings
+
+#: How a file of SQLite begins.
+_SQLITE = b"SQLite format 3\0"
 
 
 def jobs_url(settings: Settings) -> str:
@@ -59,12 +63,65 @@ def require_places(settings: Settings) -> None:
             "MORPHOFLOW_RESULTS_FOLDER must name a folder that this program may make or write to.",
             part="results_folder",
         )
-    name = missing_database(jobs_url(settings))
+    open_blobs(settings)  # refuses storage that no client can be made for
+    url = jobs_url(settings)
+    _require_on_server(url)
+    if not is_postgres(url) and not _may_hold_jobs(_file_of(url)):
+        raise _no_place_for_jobs(settings)
+
+
+def require_jobs(settings: Settings) -> None:
+    """Refuse to ask for a job where none has ever been kept; nothing is made by this.
+
+    Raises:
+        InvalidParameter: names the setting and says what it may be.
+        UnknownJob: no database of jobs has been made.
+    """
+    url = jobs_url(settings)
+    _require_on_server(url)
+    if not is_postgres(url) and _file_of(url).exists() and not _is_sqlite(_file_of(url)):
+        raise _no_place_for_jobs(settings)
+    if not is_made(url):
+        raise UnknownJob("There is no job of this identifier: no jobs have been kept where the settings say.")
+
+
+def _require_on_server(url: str) -> None:
+    name = missing_database(url)
     if name is not None:
         raise InvalidParameter(
             f"MORPHOFLOW_JOBS_DATABASE names the database {name}, which is not on its server; create it first.",
             part="jobs_database",
         )
+
+
+def _no_place_for_jobs(settings: Settings) -> InvalidParameter:
+    if settings.jobs_database.get_secret_value():
+        sentence = "MORPHOFLOW_JOBS_DATABASE must name a file of SQLite that this program may make or write to."
+        return InvalidParameter(sentence, part="jobs_database")
+    return InvalidParameter(
+        "MORPHOFLOW_RESULTS_FOLDER must lie in a folder where this program may make or write to the file jobs.sqlite; "
+        "or name a database with MORPHOFLOW_JOBS_DATABASE.",
+        part="results_folder",
+    )
+
+
+def _file_of(url: str) -> Path:
+    return Path(make_url(url).database or "")
+
+
+def _may_hold_jobs(file: Path) -> bool:
+    if not _is_writable(file.parent):
+        return False
+    return not file.exists() or (_is_sqlite(file) and os.access(file, os.W_OK))
+
+
+def _is_sqlite(file: Path) -> bool:
+    """Whether a file is one of SQLite; an empty one becomes one."""
+    try:
+        with file.open("rb") as opened:
+            return opened.read(len(_SQLITE)) in (_SQLITE, b"")
+    except OSError:
+        return False
 
 
 def _is_writable(folder: Path) -> bool:

@@ -8,9 +8,14 @@ from service.ports import MaskReader
 from service.settings import Settings
 
 
+def image_limits(settings: Settings) -> ImageLimits:
+    """What an image may cost."""
+    return ImageLimits(max_bytes=settings.max_body_bytes, max_voxels=settings.max_voxels)
+
+
 def mask_reader(settings: Settings) -> MaskReader:
     """The reader of masks with the limits of the settings."""
-    limits = ImageLimits(max_bytes=settings.max_body_bytes, max_voxels=settings.max_voxels)
+    limits = image_limits(settings)
     return lambda data, part, labels: read_masks(data, part, limits, labels)
 
 

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from model.bundle import ShapeModel
 from model.errors import MorphoFlowError
 from model.inference.reconstruction import Watch
-from model.interruption import Check
+from model.interruption import Check, unchecked
 from service.errors import Abandoned, HelperLost
 from service.observability import Log
 
@@ -55,10 +55,6 @@ OpenModels = Callable[[], Models]
 
 def unwatched(_: str) -> None:
     """A `Watch` that does nothing."""
-
-
-def unchecked() -> None:
-    """A `Check` that lets everything pass."""
 
 
 def compute_here(

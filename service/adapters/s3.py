@@ -10,6 +10,8 @@ from boto3.exceptions import Boto3Error
 from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 
+from model.errors import InvalidParameter
+
 #: Codes that say that an object is not there.
 _MISSING = ("404", "NoSuchKey", "NotFound")
 
@@ -20,6 +22,9 @@ class S3Blobs:
     Args:
         url: ``s3://bucket`` or ``s3://bucket/prefix``.
         endpoint: address of storage other than Amazon's.
+
+    Raises:
+        InvalidParameter: nothing can be asked of storage with what the environment says.
     """
 
     def __init__(self, url: str, endpoint: str | None) -> None:
@@ -34,7 +39,14 @@ class S3Blobs:
             request_checksum_calculation="when_required",  # other servers than Amazon's may know no newer ones
             response_checksum_validation="when_required",
         )
-        self._client = boto3.client("s3", endpoint_url=endpoint, config=config)
+        try:
+            self._client = boto3.client("s3", endpoint_url=endpoint, config=config)
+        except (BotoCoreError, ValueError) as fault:
+            raise InvalidParameter(
+                "MORPHOFLOW_STORAGE_URL needs a profile and a region that exist (AWS_PROFILE, AWS_DEFAULT_REGION), and "
+                "an endpoint that is an address.",
+                part="storage_url",
+            ) from fault
 
     def put(self, key: str, data: bytes) -> None:
         """Write an object, over an older one."""

@@ -158,9 +158,10 @@ def _reconstruct(tools: DrawingTools, item: Record, check: Check) -> Record:
     outcome = use_cases.reconstruct(model, stacks, _options(rule), tools.limits.max_voxels, check=check)
     outcome = replace(outcome, grid=series.grid)
     key = _key(str(drawing.SOPInstanceUID), outcome, labels)
-    derivation = Derivation(drawing, series, outcome, anatomy_of(model.manifest), key, tools.version)
+    derivation = Derivation(drawing, series, outcome, anatomy_of(model.manifest), key, tools.version, labels)
     volume = use_cases.probability_map(tools.registry, outcome, None, tools.limits.max_voxels)
-    desk.put_results(item["object"], result_objects(derivation, volume.array))
+    results = result_objects(derivation, volume.array, desk.moment_s(item["object"]))
+    desk.put_results(item["object"], results)
     return {"state": DONE, "cut": derivation.is_cut}
 
 
@@ -171,8 +172,7 @@ def _deliver(tools: DrawingTools, item: Record, archive: str) -> Record:
 
 
 def _quarantine(tools: DrawingTools, item: Record, reason: str) -> Record:
-    # Drawings that were accepted by earlier releases have no name of their own: there was one job of each.
-    tools.desk.set_aside(item["object"], item.get("drawing", item["object"]), reason)
+    tools.desk.set_aside(item["object"], item["drawing"], reason)
     tools.log.warning("object quarantined", job=item["object"], reason=reason)
     return {}
 

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from service.adapters.image_guard import ImageLimits
 from service.adapters.pacs.archives import open_archive
 from service.adapters.pacs.configuration import load_configuration
 from service.adapters.pacs.delivery import Desk
@@ -12,7 +11,7 @@ from service.observability import Log
 from service.pacs import audit_trail, silence_libraries, title_of
 from service.ports import Catalogue
 from service.settings import Settings
-from service.wiring import program_version
+from service.wiring import image_limits, program_version
 
 
 def pacs_kinds(settings: Settings, file: Path, registry: Catalogue, blobs: BlobStore, log: Log) -> tuple[JobKind, ...]:
@@ -25,5 +24,4 @@ def pacs_kinds(settings: Settings, file: Path, registry: Catalogue, blobs: BlobS
     configuration = load_configuration(file)
     audit = audit_trail(configuration, settings)
     desk = Desk(configuration, blobs, audit, open_archive, title_of(configuration))
-    limits = ImageLimits(max_bytes=settings.max_body_bytes, max_voxels=settings.max_voxels)
-    return (drawing_kind(DrawingTools(desk, registry, limits, program_version(), log)),)
+    return (drawing_kind(DrawingTools(desk, registry, image_limits(settings), program_version(), log)),)

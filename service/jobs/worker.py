@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
 
 from service.adapters.images import write_nifti
@@ -63,16 +63,15 @@ def run_worker(settings: Settings, registry: ModelRegistry, slot: int, log: Log,
         threading.Thread(target=_stop_with_input, args=(stop,), daemon=True).start()
     stand_back(settings.job_nice)
     tools = make_tools(settings, registry, log)
-    jobs = open_jobs(settings, log)
-    strays = Strays(jobs, tools.blobs)
-    with running_worker((*all_kinds(tools), *_pacs_kinds(settings, tools)), worker_options(settings, slot), log):
+    kinds, options = (*all_kinds(tools), *_pacs_kinds(settings, tools)), worker_options(settings, slot)
+    with closing(open_jobs(settings, log)) as jobs, running_worker(kinds, options, log):
+        strays = Strays(jobs, tools.blobs)
         log.info("worker started", slot=slot)
         while not stop.wait(settings.sweep_interval_s):
             remove_expired(jobs, tools.blobs, strays, settings.result_lifetime_s, log)
             with going_on(log, "models cannot be found anew"):
                 registry.refresh()
         _leave_within(_LEAVE_WITHIN_S)
-    jobs.close()
     log.info("worker stopped", slot=slot)
     sys.stderr.flush()
     os._exit(0)  # threads that follow jobs may wait for a database for ever
@@ -109,15 +108,29 @@ def remove_expired(jobs: JobEngine, blobs: BlobStore, strays: Strays, lifetime_s
         strays.sweep()
 
 
+def start_worker(slot: int) -> subprocess.Popen[bytes]:
+    """The program ``worker`` of a slot; it ends with this process."""
+    command = [sys.executable, "-m", "service.cli", "worker", "--slot", str(slot), "--attached"]
+    return subprocess.Popen(command, stdin=subprocess.PIPE)
+
+
 @contextmanager
-def supervised_workers(count: int, log: Log) -> Iterator[Callable[[], None]]:
+def supervised_workers(
+    count: int, log: Log, start: Callable[[int], "subprocess.Popen[bytes]"] = start_worker
+) -> Iterator[Callable[[], None]]:
     """So many worker processes while the context lasts; one that dies is started again under the same name.
+
+    Args:
+        count: how many.
+        log: where it is told that one died or could not be started.
+        start: starts the one of a slot.
 
     Yields:
         What tells them to end, for who has more to do before the context ends.
     """
     stop = threading.Event()
-    keepers = [threading.Thread(target=_keep, args=(slot, stop, log), name=f"worker-{slot}") for slot in range(count)]
+    tasks = [(slot, stop, log, start) for slot in range(count)]
+    keepers = [threading.Thread(target=_keep, args=task, name=f"worker-{task[0]}") for task in tasks]
     for keeper in keepers:
         keeper.start()
     try:
@@ -128,13 +141,13 @@ def supervised_workers(count: int, log: Log) -> Iterator[Callable[[], None]]:
             keeper.join()
 
 
-def _keep(slot: int, stop: threading.Event, log: Log) -> None:
+def _keep(slot: int, stop: threading.Event, log: Log, start: Callable[[int], "subprocess.Popen[bytes]"]) -> None:
     while not stop.is_set():
-        command = [sys.executable, "-m", "service.cli", "worker", "--slot", str(slot), "--attached"]
-        with subprocess.Popen(command, stdin=subprocess.PIPE) as worker:
-            while worker.poll() is None and not stop.wait(0.2):
-                continue
-            worker.terminate()
-        if not stop.is_set():
-            log.warning("worker ended and is started again", slot=slot, status=worker.returncode)
-            stop.wait(_RESTART_AFTER_S)
+        with going_on(log, "worker cannot be started"):
+            with start(slot) as worker:
+                while worker.poll() is None and not stop.wait(0.2):
+                    continue
+                worker.terminate()
+            if not stop.is_set():
+                log.warning("worker ended and is started again", slot=slot, status=worker.returncode)
+        stop.wait(_RESTART_AFTER_S)

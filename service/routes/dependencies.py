@@ -59,6 +59,12 @@ def services_of(request: Request) -> Services:
     return services
 
 
+def client_of(request: Request) -> str | None:
+    """Who sent a request, as far as its key tells (a digest of it); None where no key is asked for."""
+    client: str | None = request.scope.get("state", {}).get("client")
+    return client
+
+
 async def admitted(services: Annotated[Services, Depends(services_of)]) -> AsyncIterator[Ticket]:
     """A place among running and waiting work, until the answer has been sent."""
     with services.engine.admit() as ticket:

@@ -1,7 +1,6 @@
 """How requests become jobs: idempotency, a bound on their number, and the answer 202."""
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 from fastapi import Header, Request
 from starlette.responses import JSONResponse, Response
@@ -11,7 +10,7 @@ from service.job_ports import JobStatus
 from service.job_presentation import job_summary
 from service.job_submission import JobDesk
 from service.model_registry import pinned_name
-from service.routes.dependencies import Services, address
+from service.routes.dependencies import Services, address, client_of
 from service.routes.negotiation import listed
 
 JOBS_PATH = "/v1/jobs"
@@ -57,12 +56,15 @@ def submittable_model(services: Services, name: str | None) -> str:
         raise InvalidParameter(str(error), part="model") from None
 
 
-def submit(
-    services: Services, kind: str, asked: Mapping[str, Any], inputs: Sequence[BinaryIO], key: str | None, model: str
-) -> JobStatus:
-    """Make a job; arguments and errors as of `JobDesk.submit`."""
-    desk = JobDesk(services.jobs, services.blobs, services.settings.max_jobs)
-    return desk.submit(kind, asked, inputs, key, model=model)
+def desk_of(services: Services) -> JobDesk:
+    """Where jobs are taken in."""
+    return JobDesk(services.jobs, services.blobs, services.settings.max_jobs)
+
+
+def own_key(request: Request, key: str | None) -> str | None:
+    """An idempotency key among those of the same client: what others call theirs is another one."""
+    client = client_of(request)
+    return key if key is None or client is None else f"{client}\n{key}"
 
 
 def accepted_job(request: Request, status: JobStatus) -> Response:

@@ -1,8 +1,9 @@
 """``/v1/jobs``: long work that survives a restart, its progress, and what it made."""
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Path, Request
@@ -15,7 +16,7 @@ from service.errors import Cancelled, NotReady, Overloaded, UnknownJob, UnknownR
 from service.job_files import JobFiles, remove_job
 from service.job_ports import JobState, JobStatus
 from service.job_presentation import job_summary
-from service.job_results import MANIFEST, result_members
+from service.job_results import MANIFEST, RESULT_GONE, result_members
 from service.job_schemas import JobForm, JobSummary
 from service.job_submission import require_archive
 from service.ports import RECONSTRUCTION_JOB, SAMPLES_JOB
@@ -26,7 +27,8 @@ from service.routes.job_requests import (
     JOBS_PATH,
     IdempotencyKey,
     accepted_job,
-    submit,
+    desk_of,
+    own_key,
     submittable_model,
 )
 from service.routes.responses import ZIP, attachment, files, problems
@@ -34,8 +36,6 @@ from service.routes.strict import StrictRoute
 
 #: How often (s) a job is looked at for its events, and how often a silent line is sent so that proxies stay.
 _EVENT_POLL_S, _EVENT_SILENCE_S = 0.5, 15.0
-#: What is said of a job whose result was deleted or has expired before it.
-RESULT_GONE = "The job's result has expired or been deleted."
 _EVENTS = {"description": "server-sent events", "content": {"text/event-stream": {"schema": {"type": "string"}}}}
 
 Identifier = Annotated[str, Path(alias="id", description="identifier of the job", json_schema_extra={"format": "uuid"})]
@@ -100,16 +100,20 @@ async def create_job(
     key: IdempotencyKey = None,
 ) -> Response:
     """Answers at once; the work is done by other processes and goes on after a restart."""
+    key = own_key(request, key)
     return accepted_job(request, await services.turns.run(_submitted, services, form, key, limit_s=None))
 
 
 def _submitted(services: Services, form: JobForm, key: str | None) -> JobStatus:
-    model, asked = submittable_model(services, form.model), form.argument()
-    _require_feasible(services, form.kind, asked, model)
+    desk, asked = desk_of(services), form.argument()
     inputs = [] if form.archive is None else [form.archive.file]
+    if (earlier := desk.earlier(form.kind, asked, inputs, key)) is not None:
+        return earlier
+    model = submittable_model(services, form.model)
+    _require_feasible(services, form.kind, asked, model)
     for archive in inputs:
         require_archive(archive, parse_annotated(form.annotated), services.settings.archive_limits)
-    return submit(services, form.kind, asked, inputs, key, model)
+    return desk.submit(form.kind, asked, inputs, key, model=model)
 
 
 async def read_job(identifier: Identifier, request: Request, services: WithServices) -> JobSummary:
@@ -137,9 +141,12 @@ def _ended(services: Services, identifier: str) -> JobStatus | None:
     """A job that is cancelled now; None for one that had ended, and is forgotten."""
     if not services.jobs.status(identifier).state.is_final:
         return services.jobs.cancel(identifier)
-    remove_job(services.blobs, services.store, identifier)
-    services.jobs.forget(identifier)
-    remove_job(services.blobs, services.store, identifier)  # a part that ran until now; one that still runs does it
+    try:
+        remove_job(services.blobs, services.store, identifier)
+        services.jobs.forget(identifier)
+        remove_job(services.blobs, services.store, identifier)  # a part that ran until now; one that still runs does it
+    except OSError as fault:
+        raise Overloaded("The job's files cannot be removed now; send the request again later.") from fault
     return None
 
 
@@ -165,8 +172,9 @@ async def read_result(identifier: Identifier, request: Request, services: WithSe
         raise NotReady(f"The job has no result: its state is {status.state.value}.{why}")
     if status.kind == RECONSTRUCTION_JOB:
         return RedirectResponse(address(request, f"/v1/reconstructions/{identifier}"), 303)
-    chunks = _zip(JobFiles(services.blobs, identifier), status.kind, status.result["count"])
-    return StreamingResponse(chunks, media_type=ZIP, headers=attachment(f"{status.kind}.zip"))
+    members = result_members(JobFiles(services.blobs, identifier), status.kind, status.result["count"])
+    first = await services.turns.run(next, members)  # what is gone, or cannot be read, is told before anything is sent
+    return StreamingResponse(_zip(chain([first], members)), media_type=ZIP, headers=attachment(f"{status.kind}.zip"))
 
 
 async def _events(services: Services, status: JobStatus, prefix: str) -> AsyncIterator[str]:
@@ -184,7 +192,8 @@ async def _events(services: Services, status: JobStatus, prefix: str) -> AsyncIt
             yield ":\n\n"
         await asyncio.sleep(_EVENT_POLL_S)
         silent_s += _EVENT_POLL_S
-        status = await _looked_at(services, status)
+        if not services.closing.is_set():
+            status = await _looked_at(services, status)
 
 
 async def _looked_at(services: Services, status: JobStatus) -> JobStatus:
@@ -197,9 +206,9 @@ async def _looked_at(services: Services, status: JobStatus) -> JobStatus:
         return replace(status, state=JobState.CANCELLED, problem="The job was deleted.")
 
 
-def _zip(job: JobFiles, kind: str, count: int) -> Iterator[bytes]:
+def _zip(members: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
     archive = ZipStream(sized=False)
-    for name, data in result_members(job, kind, count):
+    for name, data in members:
         archive.add(data, name)
         yield from archive.all_files()
     yield from archive.finalize()

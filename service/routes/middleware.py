@@ -1,5 +1,6 @@
 """Around every request: its identifier, its log entry and figures, its key, and the size of its body."""
 
+import hashlib
 import hmac
 import re
 import time
@@ -82,17 +83,20 @@ class KeyMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass one request on if it carries a key or needs none."""
-        if scope["type"] == "http" and self._keys and not _is_open(scope) and not self._accepts(Headers(scope=scope)):
-            error = Unauthorised("Send a valid key in the header X-API-Key or as Authorization: Bearer.")
-            await _refuse(error, scope, receive, send)
-            return
+        if scope["type"] == "http" and self._keys and not _is_open(scope):
+            key = self._accepted(Headers(scope=scope))
+            if key is None:
+                error = Unauthorised("Send a valid key in the header X-API-Key or as Authorization: Bearer.")
+                await _refuse(error, scope, receive, send)
+                return
+            scope["state"]["client"] = hashlib.sha256(key).hexdigest()
         await self._app(scope, receive, send)
 
-    def _accepts(self, headers: Headers) -> bool:
+    def _accepted(self, headers: Headers) -> bytes | None:
         scheme, _, token = headers.get("authorization", "").partition(" ")
         offered = [headers.get("x-api-key", ""), token.strip() if scheme.lower() == "bearer" else ""]
-        matches = [hmac.compare_digest(given.encode(), key) for given in offered for key in self._keys]
-        return any(matches)
+        matches = [key for given in offered for key in self._keys if hmac.compare_digest(given.encode(), key)]
+        return matches[0] if matches else None
 
 
 class BodyLimitMiddleware:

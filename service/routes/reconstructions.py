@@ -13,6 +13,7 @@ from model.inference.surface import require_step
 from model.interruption import Check
 from service import use_cases
 from service.adapters.images import image_format
+from service.job_ports import JobStatus
 from service.job_submission import require_stacks
 from service.observability import StageTimer
 from service.ports import RECONSTRUCTION_JOB, MeshFormat, StoredResult
@@ -24,7 +25,8 @@ from service.routes.job_requests import (
     JOB_ACCEPTED,
     KeyOfJob,
     accepted_job,
-    submit,
+    desk_of,
+    own_key,
     submittable_model,
     wants_job,
 )
@@ -95,23 +97,26 @@ async def create_reconstruction(
     if len(form.mask) > services.settings.max_masks:
         raise TooLarge(f"At most {services.settings.max_masks} parts named mask are accepted.", part="mask")
     if as_job:
-        return await services.turns.run(_enqueue, request, services, form, key, limit_s=None)
+        status = await services.turns.run(_enqueue, services, form, own_key(request, key), limit_s=None)
+        return accepted_job(request, status)
     with services.engine.admit() as ticket:
         result = await run_while_connected(request, ticket, partial(_reconstruct, services, form))
     return await run_in_threadpool(_answer, request, services, result, wanted)
 
 
-def _enqueue(request: Request, services: Services, form: ReconstructionForm, key: str | None) -> Response:
+def _enqueue(services: Services, form: ReconstructionForm, key: str | None) -> JobStatus:
+    desk, options = desk_of(services), form.options()
+    asked = form.model_dump(exclude={"mask"}) | {"masks": len(form.mask)}
+    inputs = [mask.file for mask in form.mask]
+    if (earlier := desk.earlier(RECONSTRUCTION_JOB, asked, inputs, key)) is not None:
+        return earlier
     model = submittable_model(services, form.model)
-    options = form.options()
     checked_labels(parse_labels(form.label))
     if all(image_format(mask.file) != "dicom" for mask in form.mask):  # an object of DICOM may be several stacks
         require_stacks(options.annotated, len(form.mask))
     step, limit = options.resolution_mm, services.settings.max_voxels
     require_step(services.registry.get(model), step, limit, part="resolution_mm")
-    asked = form.model_dump(exclude={"mask"}) | {"masks": len(form.mask)}
-    inputs = [mask.file for mask in form.mask]
-    return accepted_job(request, submit(services, RECONSTRUCTION_JOB, asked, inputs, key, model))
+    return desk.submit(RECONSTRUCTION_JOB, asked, inputs, key, model=model)
 
 
 def _reconstruct(services: Services, form: ReconstructionForm, check: Check) -> StoredResult:

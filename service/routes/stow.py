@@ -1,6 +1,8 @@
 """``POST /dicom-web/studies``: DICOM objects that an archive forwards (STOW-RS; PS3.18, 10.5)."""
 
-from typing import Annotated, Any
+from contextlib import ExitStack, suppress
+from tempfile import SpooledTemporaryFile
+from typing import IO, Annotated, Any
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.concurrency import run_in_threadpool
@@ -9,7 +11,8 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.responses import JSONResponse, Response
 
 from model.errors import NotFound
-from service.errors import UnsupportedMediaType
+from service.errors import StoreFull, UnsupportedMediaType
+from service.full_disks import is_full
 from service.pacs_ports import Disposition, ObjectReceiver, Receipt
 from service.routes.multipart import require_plain
 from service.routes.responses import problems
@@ -20,6 +23,8 @@ MEDIA_TYPE = "application/dicom+json"
 SENDER = "STOW-RS"
 #: Failure reasons of an object (PS3.18, I.2.2): not understood; not kept; not what the request says that it is.
 CANNOT_UNDERSTAND, PROCESSING_FAILURE, DOES_NOT_MATCH = 0xC000, 0x0110, 0xA900
+#: Bytes of an object that are in memory while the others are received; the rest is on the disk.
+IN_MEMORY = 1 << 20
 
 
 def receiver_of(request: Request) -> ObjectReceiver:
@@ -59,7 +64,7 @@ def stow_router() -> APIRouter:
             200: {"description": "all were taken", "content": {MEDIA_TYPE: {"schema": {"type": "object"}}}},
             202: {"description": "some were taken", "content": {MEDIA_TYPE: {"schema": {"type": "object"}}}},
             409: {"description": "none was taken", "content": {MEDIA_TYPE: {"schema": {"type": "object"}}}},
-            **problems(400, 404, 413, 415),
+            **problems(400, 404, 413, 415, 507),
         },
     }
     router.add_api_route(PATH, store_instances, summary="Take DICOM objects (STOW-RS)", **shared)
@@ -80,8 +85,9 @@ async def store_instances(
 
 
 async def _store(request: Request, receiver: ObjectReceiver, boundary: bytes, study: str | None) -> Response:
-    objects = await parts_of(request, boundary)
-    receipts = [await run_in_threadpool(_receive, receiver, found, study) for found in objects]
+    with ExitStack() as kept:
+        objects = await parts_of(request, boundary, kept)
+        receipts = [await run_in_threadpool(_receive, receiver, found, study) for found in objects]
     taken = [r for r in receipts if r.disposition in (Disposition.ACCEPTED, Disposition.LEFT_ALONE)]
     status = 200 if len(taken) == len(receipts) > 0 else 202 if taken else 409
     return JSONResponse(response_module(receipts), status, media_type=MEDIA_TYPE)
@@ -97,29 +103,45 @@ async def store_study_instances(
     return await _store(request, receiver, boundary, study)
 
 
-async def parts_of(request: Request, boundary: bytes) -> list[bytes]:
-    """Bodies of the parts.
+async def parts_of(request: Request, boundary: bytes, kept: ExitStack) -> list[IO[bytes]]:
+    """Bodies of the parts as temporary files, which end with `kept`.
 
     Raises:
         UnsupportedMediaType: the body is not complete.
+        StoreFull: the disk of temporary files has no room for the body.
     """
-    parts: list[bytearray] = []
+    parts: list[IO[bytes]] = []
     ended: list[bool] = []
     callbacks: Any = {
-        "on_part_begin": lambda: parts.append(bytearray()),
-        "on_part_data": lambda data, start, end: parts[-1].extend(data[start:end]),
+        "on_part_begin": lambda: parts.append(_begun(kept)),
+        "on_part_data": lambda data, start, end: parts[-1].write(data[start:end]),
         "on_end": lambda: ended.append(True),
     }
     try:
         parser = MultipartParser(boundary, callbacks)
         async for chunk in request.stream():
-            parser.write(chunk)
+            await run_in_threadpool(parser.write, chunk)
         parser.finalize()
     except MultipartParseError:
         ended.clear()
+    except OSError as fault:
+        if is_full(fault):
+            raise StoreFull("The disk has no room for what was sent; send the request again later.") from fault
+        raise
     if not ended:
         raise UnsupportedMediaType("The request's body must be complete multipart/related with one object a part.")
-    return [bytes(part) for part in parts]
+    return parts
+
+
+def _begun(kept: ExitStack) -> IO[bytes]:
+    file = SpooledTemporaryFile(IN_MEMORY)  # noqa: SIM115 - the stack closes it
+    kept.callback(_close, file)
+    return file
+
+
+def _close(file: IO[bytes]) -> None:
+    with suppress(OSError):  # a disk without room for what is written at the end
+        file.close()
 
 
 def response_module(receipts: list[Receipt]) -> dict[str, Any]:
@@ -143,8 +165,9 @@ def response_module(receipts: list[Receipt]) -> dict[str, Any]:
     return {tag: {"vr": "SQ", "Value": items} for tag, items in groups.items()}
 
 
-def _receive(receiver: ObjectReceiver, data: bytes, study: str | None) -> Receipt:
+def _receive(receiver: ObjectReceiver, found: IO[bytes], study: str | None) -> Receipt:
     try:
-        return receiver.receive(data, SENDER, study)
+        found.seek(0)
+        return receiver.receive(found.read(), SENDER, study)
     except OSError:
         return Receipt(Disposition.FAILED)

@@ -6,9 +6,10 @@ import threading
 from contextlib import contextmanager
 
 import httpx
-import uvicorn
 
+from benchmarks.ports import free_port
 from service.observability import make_log
+from service.serving import Server
 from tests.service_parts import app_for, running
 
 JOBS = "/v1/jobs"
@@ -39,23 +40,15 @@ def test_the_stream_of_a_job_that_is_deleted_ends_as_others_do(tmp_path):
     assert "deleted" in last["problem"]
 
 
-class ClosingServer(uvicorn.Server):
-    """Says when it begins to shut down, as that of the program does."""
-
-    async def shutdown(self, sockets=None):
-        self.config.app.state.services.closing.set()
-        await super().shutdown(sockets)
-
-
 @contextmanager
 def stoppable(app):
-    """A client of a server, and how to begin its end."""
-    server = ClosingServer(uvicorn.Config(app, host="127.0.0.1", port=0, log_config=None, access_log=False))
+    """A client of the program's server, and how to begin its end."""
+    server = Server(app, lambda: None)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     while not server.started and thread.is_alive():
         thread.join(0.01)
-    address = f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    address = f"http://127.0.0.1:{app.state.services.settings.port}"
     with httpx.Client(base_url=address, timeout=60.0) as client:
         yield client, server
     server.should_exit = True
@@ -65,7 +58,7 @@ def stoppable(app):
 
 def test_streams_end_when_the_server_begins_to_shut_down(tmp_path):
     log = io.StringIO()
-    with stoppable(app_for(tmp_path, log=log)) as (client, server):
+    with stoppable(app_for(tmp_path, log=log, port=free_port())) as (client, server):
         place = client.post(JOBS, files=FORM).json()["links"]["events"]
         with client.stream("GET", place) as response:
             told = events(response)

@@ -6,6 +6,7 @@ import zipfile
 
 import pytest
 
+from tests.analytic_model import ellipsoid_model
 from tests.dicom_parts import file_bytes, mr_series, seg_of
 from tests.job_parts import ended, working
 from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, problem, running, sparse_ellipsoid
@@ -211,6 +212,42 @@ def test_a_job_whose_result_was_deleted_says_so_and_leads_nowhere(client):
     told = problem(client.get(f"{place}/result", follow_redirects=False), 404)
     assert (told["type"], told["detail"]) == ("urn:morphoflow:problem:unknown-result", summary["problem"])
     assert client.delete(place).status_code == 204
+
+
+def test_a_job_whose_files_are_gone_leads_nowhere(client, app):
+    summary = ended(client, client.post(JOBS, files=form(kind="samples", count=2)).headers["location"])
+    app.state.services.blobs.delete(f"jobs/{summary['id']}/")
+    told = problem(client.get(summary["links"]["result"]), 404)
+    assert told["type"].endswith("unknown-result")
+    assert "deleted" in told["detail"]
+
+
+def test_a_request_sent_again_is_answered_with_its_job_though_its_model_is_gone(tmp_path):
+    key = {"Idempotency-Key": "one"}
+
+    def sent(client):
+        samples = client.post(JOBS, files=form(kind="samples", count=2, model=NAME), headers=key)
+        wish = {**key, "Prefer": "respond-async"}
+        single = client.post("/v1/reconstructions", files=mask_parts(), data={"model": NAME}, headers=wish)
+        return [(answer.status_code, answer.headers["location"]) for answer in (samples, single)]
+
+    with running(app_for(tmp_path)) as client:
+        first = sent(client)
+    with running(app_for(tmp_path, ellipsoid_model("other"))) as client:
+        assert sent(client) == first
+        assert problem(client.post(JOBS, files=form(kind="samples", count=2, model=NAME)), 422)["part"] == "model"
+
+
+def test_the_same_key_of_two_clients_is_two_jobs(tmp_path):
+    def asked(client, who, count):
+        headers = {"Idempotency-Key": "one", "X-API-Key": who}
+        return client.post(JOBS, files=form(kind="samples", count=count), headers=headers)
+
+    with running(app_for(tmp_path, api_keys=("a", "b"))) as client:
+        mine, theirs = asked(client, "a", 2).json()["id"], asked(client, "b", 3).json()["id"]
+        assert mine != theirs
+        assert [asked(client, "a", 2).json()["id"], asked(client, "b", 3).json()["id"]] == [mine, theirs]
+        assert problem(asked(client, "b", 2), 422)["part"] == "Idempotency-Key"
 
 
 @pytest.mark.parametrize("name", ["%00", "nothing", "%7Bx%7D"])

@@ -12,7 +12,7 @@ from benchmarks.pacs.orthanc import is_installed
 from benchmarks.ports import free_ports
 from service.adapters.dicom.results import RESULTS
 from service.adapters.pacs.archives import open_archive
-from service.adapters.pacs.audit import broken_line
+from service.adapters.pacs.audit import TrailCheck, check_trail
 from service.adapters.pacs.configuration import Archive
 from service.pacs_ports import Disposition
 from tests.dicom_parts import PATIENT_ID, PATIENT_NAME, file_bytes, mr_series, reread, ring, rtstruct_of, seg_of
@@ -49,7 +49,7 @@ def test_a_drawing_becomes_results_in_its_study(way, orthanc, tmp_path):
     with service.working():
         service.until_empty()
     assert len(results_in(orthanc, images[0].StudyInstanceUID)) == len(RESULTS)
-    assert broken_line(tmp_path / "audit.jsonl") is None
+    assert check_trail(tmp_path / "audit.jsonl") == TrailCheck(None)
     trail = (tmp_path / "audit.jsonl").read_text()
     assert all(name in trail for name in ("VIEWER", "archive", drawing.SOPInstanceUID))
 

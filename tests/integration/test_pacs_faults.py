@@ -13,6 +13,7 @@ from service.adapters.pacs.commitment import COMMITMENTS
 from service.adapters.pacs.configuration import Archive, Listener
 from service.adapters.pacs.dimse_client import DimseArchive
 from service.adapters.pacs.dimse_server import dimse_listener
+from service.pacs import Tally
 from tests.dicom_parts import file_bytes
 from tests.pacs_archives import TITLE, FakeArchive
 from tests.pacs_parts import Looks, Service, drawn_series, service_with
@@ -24,7 +25,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("sockets_of_refused_peer
 @contextmanager
 def listening(service: Service, port: int) -> Iterator[None]:
     listener = Listener(port=port, calling_ae_titles=(TITLE,))
-    with dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log):
+    with dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log, Tally().add):
         yield
 
 

@@ -53,13 +53,15 @@ def test_compressed_images_are_fetched_as_they_are(way, orthanc, ports):
 
 
 @beside_orthanc
+@pytest.mark.parametrize("way", ["C-GET", "C-MOVE"])
 @pytest.mark.parametrize("kind", [NuclearMedicineImageStorage, EnhancedUSVolumeStorage])
-def test_images_of_other_classes_are_fetched(kind, orthanc, tmp_path):
+def test_images_of_other_classes_are_fetched(kind, way, orthanc, ports, tmp_path):
     images = [reread(image) for image in mr_series((12, 10, 3))]
     for image in images:
         image.SOPClassUID = image.file_meta.MediaStorageSOPClassUID = kind
     put_images(orthanc, tmp_path, images)
-    found = open_archive(by_get(orthanc)).images(images[0].StudyInstanceUID, images[0].SeriesInstanceUID)
+    archive = open_archive(by_get(orthanc) if way == "C-GET" else by_move(orthanc, ports.own))
+    found = archive.images(images[0].StudyInstanceUID, images[0].SeriesInstanceUID)
     assert len(found.images) == len(images)
 
 

@@ -6,7 +6,7 @@ import shutil
 import socket
 import ssl
 import subprocess
-import time
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -17,6 +17,8 @@ from pydicom import Dataset, dcmread
 from pydicom.encaps import encapsulate
 from pydicom.uid import JPEG2000Lossless, MRImageStorage
 from pynetdicom import AE
+from pynetdicom.association import Association
+from pynetdicom.dul import DULServiceProvider
 
 from benchmarks.pacs.orthanc import is_installed, send
 from benchmarks.ports import free_ports
@@ -27,7 +29,9 @@ from service.adapters.pacs.configuration import Listener, MoveDestination, Tls
 from service.adapters.pacs.dimse_client import DimseArchive
 from service.adapters.pacs.dimse_server import dimse_listener
 from service.adapters.pacs.inbox import INBOX, OBJECT
+from service.adapters.pacs.moved_images import MOST_ASSOCIATIONS
 from service.adapters.pacs.tls import client_context
+from service.pacs import Tally
 from tests.dicom_parts import file_bytes, mr_series
 from tests.pacs_archives import TITLE, FakeArchive
 from tests.pacs_parts import (
@@ -51,9 +55,11 @@ pytestmark = [
 
 
 @contextmanager
-def listening(service: Service, listener: Listener) -> Iterator[None]:
-    with dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log):
-        yield
+def listening(service: Service, listener: Listener) -> Iterator[Tally]:
+    """The listener; counts associations that are one too many."""
+    turned_away = Tally()
+    with dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log, turned_away.add):
+        yield turned_away
 
 
 def associate(port: int, caller: str, called: str = "MORPHOFLOW", **more):
@@ -79,7 +85,8 @@ def test_only_listed_callers_are_heard(orthanc, tmp_path):
 def test_a_port_with_silent_connections_is_open(tmp_path):
     service = service_with(tmp_path, FakeArchive([]).settings())
     (port,) = free_ports(1)
-    with listening(service, Listener(port=port, calling_ae_titles=("VIEWER",))), ExitStack() as silent:
+    listener = Listener(port=port, calling_ae_titles=("VIEWER",), maximum_associations=1)
+    with listening(service, listener), ExitStack() as silent:
         for _ in range(20):
             silent.enter_context(socket.create_connection(("127.0.0.1", port)))
         peer = associate(port, "VIEWER")
@@ -101,11 +108,12 @@ def test_one_association_too_many_is_no_alert(tmp_path):
     service = service_with(tmp_path, FakeArchive([]).settings())
     (port,) = free_ports(1)
     listener = Listener(port=port, calling_ae_titles=("VIEWER",), maximum_associations=2)
-    with listening(service, listener):
+    with listening(service, listener) as turned_away:
         peers = [associate(port, "VIEWER") for _ in range(3)]
         assert [peer.is_established for peer in peers] == [True, True, False]
         assert peers[2].is_rejected
         until(lambda: "association turned away" in service.said.getvalue())
+        assert turned_away.count() == 1
         for peer in peers[:2]:
             peer.release()
     assert not (tmp_path / "audit.jsonl").exists()
@@ -178,7 +186,12 @@ def test_associations_over_tls_need_a_certificate(orthanc, tmp_path, certificate
             stranger.send_c_echo()
         assert not stranger.is_established
     del stranger
-    time.sleep(1)  # the library's threads let go of the refused sockets
+    let_go()
+
+
+def let_go() -> None:
+    """Have the sockets of refused peers collected, once the library's threads that hold them have ended."""
+    until(lambda: not any(isinstance(thread, Association | DULServiceProvider) for thread in threading.enumerate()))
     gc.collect()
 
 
@@ -211,6 +224,17 @@ def test_moved_images_are_those_that_were_asked_for():
     assert found.failed == 0
 
 
+def test_silent_connections_keep_no_moved_images_away():
+    images, (port,) = mr_series((12, 10, 4)), free_ports(1)
+    archive = FakeArchive(images, destination=MoveDestination(ae_title="MORPHOMOVE", port=port))
+    with ExitStack() as silent, archive.running():
+        archive.before_moving = lambda: [
+            silent.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(2 * MOST_ASSOCIATIONS)
+        ]
+        found = DimseArchive(archive.settings()).images(images[0].StudyInstanceUID, images[0].SeriesInstanceUID)
+    assert {image.SOPInstanceUID for image in found.images} == {image.SOPInstanceUID for image in images}
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the library's refused socket
 def test_images_are_moved_over_tls_where_the_archive_has_it(certificates):
     images = mr_series()
@@ -223,8 +247,7 @@ def test_images_are_moved_over_tls_where_the_archive_has_it(certificates):
         found = DimseArchive(archive.settings()).images(images[0].StudyInstanceUID, images[0].SeriesInstanceUID)
     assert bare == [[]]
     assert len(found.images) == len(images)
-    time.sleep(1)  # the library's threads let go of the refused sockets
-    gc.collect()
+    let_go()
 
 
 def compressed(image: Dataset) -> Dataset:
@@ -289,6 +312,7 @@ def test_stow_answers_for_each_object(orthanc, tmp_path, pacs_file):
         assert stow(client, b"nonsense").status_code == 409
         assert "morphoflow_dicom_backlog 1.0" in client.get("/metrics").text
         assert "morphoflow_dicom_quarantined 1.0" in client.get("/metrics").text
+        assert "morphoflow_dicom_turned_away 0.0" in client.get("/metrics").text
         torn = client.post(
             "/dicom-web/studies", content=b"--b\r\n", headers={"content-type": taken.request.headers["content-type"]}
         )

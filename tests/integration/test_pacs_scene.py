@@ -11,7 +11,7 @@ from benchmarks.pacs.orthanc import is_installed
 from benchmarks.pacs.scene import play
 from benchmarks.pacs.storm import storm
 from service.adapters.dicom.results import RESULTS
-from service.adapters.pacs.audit import broken_line
+from service.adapters.pacs.audit import TrailCheck, check_trail
 
 pytestmark = [
     pytest.mark.slow,
@@ -27,7 +27,7 @@ def test_three_planes_come_back_as_results(dicomweb, tmp_path, shared_data):
     assert scene.errors == ()
     assert scene.dice_archive == pytest.approx(scene.dice_rest, abs=0.002)
     assert scene.dice_archive > 0.8
-    assert broken_line(tmp_path / "scene" / "service" / "audit.jsonl") is None
+    assert check_trail(tmp_path / "scene" / "service" / "audit.jsonl") == TrailCheck(None)
 
 
 def test_one_command_plays_the_scene(tmp_path, repository: Path):

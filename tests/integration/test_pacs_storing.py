@@ -1,4 +1,4 @@
-"""Archives that show late what they took, or that take no queries."""
+"""Archives that show late what they took, that refuse it, or that take no queries."""
 
 import io
 import threading
@@ -13,6 +13,8 @@ from benchmarks.ports import free_ports
 from service.adapters.dicom.results import RESULTS
 from service.adapters.pacs.configuration import Listener, PacsConfiguration, Rule
 from service.adapters.pacs.dimse_server import dimse_listener
+from service.pacs import Tally
+from service.pacs_ports import Disposition
 from tests.dicom_parts import file_bytes
 from tests.pacs_archives import TITLE, FakeArchive
 from tests.pacs_parts import Service, drawn_series, service_with
@@ -80,6 +82,33 @@ def test_what_is_there_already_counts_as_stored(tmp_path):
     assert service.reasons() == []
 
 
+@dataclass
+class RefusingArchive(FakeArchive):
+    """Takes one result and no more until it is told to."""
+
+    takes_all: threading.Event = field(default_factory=threading.Event)
+
+    def _store(self, event: Any) -> int:
+        return super()._store(event) if self.takes_all.is_set() or not self.stored else 0xC000
+
+
+def test_results_that_an_archive_refused_are_sent_again_on_demand(tmp_path):
+    images, drawing = drawn_series()
+    archive = RefusingArchive(images)
+    service = service_with(tmp_path, archive.settings(), senders=("VIEWER",))
+    service.inbox.receive(file_bytes(drawing), "VIEWER")
+    with archive.running(), service.working():
+        service.until_empty()
+        assert service.reasons() == ["The archive refused a result with status C000."]
+        archive.takes_all.set()
+        (name,) = service.inbox.in_quarantine()
+        assert service.inbox.send_again(name) is Disposition.ACCEPTED
+        assert service.inbox.quarantined() == 0
+        service.until_empty()
+    assert service.reasons() == []
+    assert len(set(archive.stored)) == len(archive.stored) == len(RESULTS)
+
+
 def test_a_silent_archive_without_queries_is_asked_again_and_sent_nothing_twice(tmp_path):
     images, drawing = drawn_series()
     source, target, (port,) = FakeArchive(images), FakeArchive([], answers_queries=False), free_ports(1)
@@ -90,7 +119,7 @@ def test_a_silent_archive_without_queries_is_asked_again_and_sent_nothing_twice(
     service = Service(tmp_path, configuration, io.StringIO())
     service.inbox.receive(file_bytes(drawing), "VIEWER")
     listener = Listener(port=port, calling_ae_titles=(TITLE,))
-    heard = dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log)
+    heard = dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log, Tally().add)
     with source.running(), target.running(), heard, service.working():
         until(lambda: len(target.requests) == 3)
         transaction, asked = target.requests[-1]

@@ -58,6 +58,10 @@ def test_left_and_right_in_one_drawing_are_two_reconstructions(images, tmp_path)
         service.inbox.receive(file_bytes(drawing), "VIEWER")  # once more
         assert service.inbox.backlog() == 0
     assert len(set(archive.stored)) == len(archive.stored) == 2 * len(RESULTS)
+    names = [found.SegmentSequence[0].SegmentLabel for found in archive.results if "SegmentSequence" in found]
+    assert sorted(names) == ["left hippocampus"] * 2 + ["right hippocampus"] * 2
+    numbers = ["#1" in found.SeriesDescription for found in archive.results]
+    assert sum(numbers) == sum("#2" in found.SeriesDescription for found in archive.results) == len(RESULTS)
     grid = grid_of(images)
     between = -grid.to_world((np.array([grid.shape]) - 1) / 2)[0][0]  # LPS
     (left, most_left), (least_right, right) = sides_of(archive.results)

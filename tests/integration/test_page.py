@@ -2,7 +2,9 @@
 
 import json
 import re
+from gzip import decompress as gunzip
 
+import httpx
 import nibabel as nib
 import nrrd
 import numpy as np
@@ -130,12 +132,19 @@ def test_masks_of_every_kind_are_dropped_and_shown_before_they_are_sent(visit, r
     expect(visit.page.get_by_role("button", name="Reconstruct", exact=True)).to_be_disabled()
 
 
-def test_what_cannot_be_read_is_told_in_the_services_words(browser, address, tmp_path):
-    (tmp_path / "letter.nii").write_bytes(b"Dear reader")
-    with visiting(browser, address, expected="status of 415") as visit:
+def test_what_cannot_be_read_is_told_in_the_services_words(browser, address, repository, tmp_path):
+    whole = (repository / EXAMPLE).read_bytes()
+    files = {"letter.nii": b"Dear reader", "half.nii.gz": whole[: len(whole) // 2], "short.nii": gunzip(whole)[:2000]}
+    with visiting(browser, address, expected="status of 4") as visit:
         visit.go()
-        visit.page.get_by_label("Choose mask files").set_input_files(tmp_path / "letter.nii")
-        expect(visit.page.get_by_role("alert").filter(has_text="mask[0]")).to_be_visible()
+        for name, data in files.items():
+            (tmp_path / name).write_bytes(data)
+            told = httpx.post(f"{address}/v1/planes", files={"mask": (name, data)}).json()["detail"]
+            assert "mask[0]" in told
+            visit.page.get_by_label("Choose mask files").set_input_files(tmp_path / name)
+            expect(visit.page.get_by_role("alert").filter(has_text=told)).to_be_visible()
+            visit.page.get_by_role("button", name=f"Remove {name}").click()
+            expect(visit.page.get_by_text(told)).to_have_count(0)
 
 
 def test_a_dropped_file_is_taken(visit, repository):
@@ -282,8 +291,12 @@ def test_work_can_be_cancelled(visit):
     take_example(visit)
     visit.page.get_by_label("Uncertainty", exact=True).select_option("ensemble")
     visit.page.get_by_role("button", name="Reconstruct", exact=True).click()
+    expect(visit.page.get_by_label("Progress")).to_have_js_property("value", 0)
     visit.page.get_by_role("button", name="Cancel").click()
     expect(visit.page.get_by_text("Cancelled.")).to_be_visible()
+    expect(visit.shown(".preview")).to_be_visible()
+    visit.page.get_by_label("Uncertainty", exact=True).select_option("none")
+    reconstruct(visit)
 
 
 def test_the_page_asks_for_the_key_behind_a_prefix_and_keeps_it_in_the_tab(browser, shipped_bundles, tmp_path):  # noqa: ARG001

@@ -91,6 +91,15 @@ def test_a_result_that_was_opened_outlives_the_next_strokes(visit, address):
         button(visit, "Undo").click()
     assert httpx.get(opened).status_code == 200
     assert httpx.get(unopened).status_code == 404
+    surface_from(visit, 2)
+    taken = result_of(visit, address)
+    assert taken not in (opened, unopened)
+    visit.shown(".told a").dispatch_event("contextmenu")
+    button(visit, "Redo").click()
+    surface_from(visit, 3)
+    with visit.page.expect_response(lambda answer: answer.request.method == "DELETE"):
+        button(visit, "Undo").click()
+    assert httpx.get(taken).status_code == 200
 
 
 def test_another_model_takes_over_drawing_and_image(visit, address, image):
@@ -113,6 +122,22 @@ def test_an_empty_grid_fits_the_chosen_model_as_long_as_nothing_is_drawn(visit):
     visit.shown(".split").get_by_label("Model").select_option("talus")
     expect(place).not_to_have_text(before)
     expect(button(visit, "Undo")).to_be_disabled()
+
+
+def test_what_is_drawn_before_the_grid_of_another_model_arrives_stays(visit):
+    place = visit.shown("[data-plane=axial] .place")
+    before = place.inner_text()
+    held = []
+    visit.page.route("**/v1/models/talus", lambda route: held.append(route))
+    with visit.page.expect_request("**/v1/models/talus"):
+        visit.shown(".split").get_by_label("Model").select_option("talus")
+    draw(visit, "axial")
+    with visit.page.expect_response("**/v1/models/talus") as answered:
+        held[0].continue_()
+    answered.value.finished()
+    drag_ellipse(visit.page, "coronal", *AXES["coronal"])
+    surface_from(visit, 2)
+    expect(place).to_have_text(before)
 
 
 def test_a_new_grid_or_image_is_undone_as_a_stroke_is(visit, image, tmp_path):

@@ -10,11 +10,12 @@ import pytest
 import yaml
 
 from service.routes.middleware import OPEN_PATHS
+from service.serving import DRAIN_S
 from service.settings import Settings
 
 LABELS = {"app.kubernetes.io/name": "morphoflow"}
-#: How long (s) running requests, and workers meanwhile, may take to end.
-REQUESTS_S, LEAVE_WITHIN_S = 30, 30
+#: How long (s) workers may take to end, while running requests do.
+LEAVE_WITHIN_S = 30
 
 
 @pytest.fixture(scope="module")
@@ -110,12 +111,15 @@ def test_prometheus_brings_a_key_to_the_replicas(objects, repository: Path):
     assert scrape["metrics_path"] not in OPEN_PATHS
     assert scrape["authorization"]["type"] == "Bearer"
     assert "annotations" not in template["metadata"]
+    assert "`docker/prometheus.yaml`" in (repository / "docs" / "operations.md").read_text()
 
 
-def test_a_queue_that_is_full_for_a_while_takes_no_replica_out(compose, objects):
+def test_a_queue_that_is_full_for_a_while_takes_no_replica_out(compose, objects, repository: Path):
     (container,) = pod(objects["Deployment", "service"])["containers"]
     probe = container["readinessProbe"]
     assert probe["periodSeconds"] * probe["failureThreshold"] >= 300
+    told = " ".join((repository / "docs" / "operations.md").read_text().split())
+    assert f"after {probe['failureThreshold']} failed probes, {probe['periodSeconds']} s apart" in told
     assert "httpchk GET /healthz" in compose["configs"]["balancer"]["content"]
 
 
@@ -127,4 +131,8 @@ def test_what_is_told_to_stop_has_the_time_that_it_takes(compose, objects, repos
         "worker": int(compose["services"]["worker"]["stop_grace_period"].removesuffix("s")),
         "pod": pod(objects["Deployment", "service"])["terminationGracePeriodSeconds"],
     }
-    assert min(seconds.values()) > max(REQUESTS_S, LEAVE_WITHIN_S)
+    assert min(seconds.values()) > max(DRAIN_S, LEAVE_WITHIN_S)
+    told = (repository / "docs" / "operations.md").read_text()
+    for name, file in (("with workers", "compose.yaml"), ("service", "compose.scale.yaml")):
+        assert f"{seconds[name]} s in `{file}`" in told
+    assert f"`terminationGracePeriodSeconds` {seconds['pod']} s" in told

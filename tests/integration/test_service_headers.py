@@ -94,3 +94,27 @@ def test_a_copy_that_is_held_is_confirmed_while_too_much_work_waits(tmp_path):
             assert client.get(path, headers={"If-None-Match": tag}).status_code == 304
         decoder.gate.set()
         assert busy.result(30.0).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/%00",
+        f"{RECONSTRUCTIONS}/%00",
+        f"{RECONSTRUCTIONS}/%00/mesh",
+        f"{RECONSTRUCTIONS}/%00/segmentation",
+        "/v1/models/%00",
+        "/v1/models/a%00b/samples/1",
+        "/v1/models/%00/modes",
+        "/page/%00",
+        "/static-offline-docs/%00",
+        "/dicom-web/studies%00",
+    ],
+)
+def test_nothing_stands_at_a_path_with_a_null_byte(client, path):
+    assert client.get(path).status_code == 404
+
+
+@pytest.mark.parametrize("path", [f"{RECONSTRUCTIONS}/%00", "/v1/jobs/%00"])
+def test_nothing_of_a_name_with_a_null_byte_is_deleted(client, path):
+    problem(client.delete(path), 404)

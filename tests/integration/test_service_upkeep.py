@@ -1,17 +1,22 @@
 """A service keeps itself up while it runs, whatever becomes of one turn, and leaves nothing open at its end."""
 
+import asyncio
 import json
 import shutil
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from io import StringIO
 
+import pytest
+
 from model.bundle import POPULATION, file_digest, read_manifest, write_manifest
-from service.app import create_app
+from service.app import create_app, lifespan
 from service.model_registry import ModelRegistry, load_registry
 from service.observability import make_log
 from tests.analytic_model import ellipsoid_model
-from tests.service_parts import running, settings_for
+from tests.service_parts import app_for, running, settings_for
+from tests.waiting import until
 
 
 def until_listed(client, *names, limit_s=120.0):
@@ -77,3 +82,53 @@ def test_a_damaged_bundle_is_told_and_good_ones_still_come_and_go(shipped_bundle
         until_listed(client)
     assert "broken model" in events(log)
     assert "models cannot be found anew" not in events(log)
+
+
+def test_all_is_closed_though_one_part_cannot_be(tmp_path):
+    ended, log = [], StringIO()
+    app = app_for(tmp_path, log=log)
+
+    def part(name, fault=None):
+        ended.append(name)
+        if fault is not None:
+            raise fault
+
+    @contextmanager
+    def archives():
+        yield
+        part("archives", RuntimeError("an archive does not let go"))
+
+    close = [lambda: part("first"), lambda: part("second", OSError("a database is away")), lambda: part("third")]
+
+    async def lived():
+        shared = {"services": app.state.services, "sweep": lambda: 0}
+        async with lifespan(app, pacs=archives(), close=close, **shared):
+            assert ended == []
+
+    with pytest.raises(OSError, match="away"):
+        asyncio.run(lived())
+    assert ended == ["archives", "third", "second", "first"]
+    assert events(log)[-1] == "stopped"
+
+
+def test_results_that_cannot_be_swept_do_not_end_the_upkeep(tmp_path):
+    app, log, turns = app_for(tmp_path, sweep_interval_s=0.01), StringIO(), []
+    services = replace(app.state.services, log=make_log("info", log))
+
+    def sweep():
+        turns.append(1)
+        if len(turns) < 3:
+            raise PermissionError("the folder belongs to somebody else")
+        return 1
+
+    async def lived():
+        async with lifespan(app, services=services, pacs=nothing(), sweep=sweep, close=()):
+            await asyncio.to_thread(until, lambda: "expired results removed" in events(log))
+
+    asyncio.run(lived())
+    assert events(log).count("the results' folder cannot be swept") == 2
+
+
+@contextmanager
+def nothing():
+    yield

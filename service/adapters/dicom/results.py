@@ -20,11 +20,14 @@ from service.adapters.dicom.result_surfaces import encapsulated_stl, surface_seg
 RESULTS = ("segmentation", "occupancy", "entropy", "stl", "surface", "report")
 
 
-def result_objects(derivation: Derivation, probability: Float[np.ndarray, "i j k"]) -> dict[str, Dataset]:
+def result_objects(
+    derivation: Derivation, probability: Float[np.ndarray, "i j k"], moment_s: float
+) -> dict[str, Dataset]:
     """The results by name, in the order of `RESULTS`.
 
     Args:
         probability: occupancy on the grid of the series.
+        moment_s: when they are made, which all of them say (seconds since 1970).
     """
     with quiet():
         drawn = segmentation(derivation, probability >= OCCUPIED)
@@ -36,7 +39,7 @@ def result_objects(derivation: Derivation, probability: Float[np.ndarray, "i j k
             "surface": surface_segmentation(derivation),
             "report": report(derivation, drawn),
         }
-        _date(results.values(), time_zone(derivation.series.images[0]))
+        _date(results.values(), moment_s, time_zone(derivation.series.images[0]))
         return results
 
 
@@ -48,14 +51,14 @@ def time_zone(image: Dataset) -> tzinfo | None:
         return None
 
 
-def _date(results: Iterable[Dataset], zone: tzinfo | None) -> None:
+def _date(results: Iterable[Dataset], moment_s: float, zone: tzinfo | None) -> None:
     """One moment for all, in the images' time zone; in the machine's where they name none.
 
     An offset is said to be that of all dates of an object, so also of the study's, which come from the images.
     """
-    now = datetime.now(zone)
+    moment = datetime.fromtimestamp(moment_s, zone)
     for found in results:
-        found.InstanceCreationDate, found.InstanceCreationTime = DA(now.date()), TM(now.time())
+        found.InstanceCreationDate, found.InstanceCreationTime = DA(moment.date()), TM(moment.time())
         found.ContentDate, found.ContentTime = found.InstanceCreationDate, found.InstanceCreationTime
         if zone is not None:
-            found.TimezoneOffsetFromUTC = now.strftime("%z")
+            found.TimezoneOffsetFromUTC = moment.strftime("%z")

@@ -43,7 +43,7 @@ def read_segmentation(
 
     Raises:
         UnreadableImage, InvalidGeometry: damaged, or planes that are none.
-        InvalidMask: nothing drawn, or no such segment.
+        InvalidMask: nothing drawn, no such segment, or pixels of a segment that the object does not describe.
         TooLarge: over a limit.
     """
     checked_labels(labels)
@@ -119,16 +119,18 @@ def _drawings(found: Dataset, part: str, labels: frozenset[int] | None) -> Itera
     """Which pixels of each frame are of the object."""
     with tolerant(part):
         kind, most = str(found.SegmentationType), float(found.get("MaximumFractionalValue") or 1)
-        known = _numbers(found)
+        known, ground = _numbers(found), _background(found)
         segments = [] if kind == "LABELMAP" else _segments_of_frames(found)
     if labels is not None and not labels <= known:
         raise InvalidMask(
             f"{part} has no segment {listed(labels - known)}; segments that are there: {listed(known) or 'none'}",
             part=part,
         )
+    _require_described(frozenset(segments), known, part)
     wanted = known & (labels or known)
     for number, frame in enumerate(frames_of(found, part)):
         if kind == "LABELMAP":
+            _require_described(frozenset(np.unique(frame).tolist()) - {ground}, known, part)
             yield np.isin(frame, sorted(wanted))
         elif kind == "FRACTIONAL":
             yield (frame >= OCCUPIED * most) & (segments[number] in wanted)
@@ -136,14 +138,27 @@ def _drawings(found: Dataset, part: str, labels: frozenset[int] | None) -> Itera
             yield (frame != 0) & (segments[number] in wanted)
 
 
+def _require_described(drawn: frozenset[int], known: frozenset[int], part: str) -> None:
+    if not drawn <= known:
+        raise InvalidMask(
+            f"{part} draws segment {listed(drawn - known)}, which it does not describe; "
+            f"segments that are there: {listed(known) or 'none'}",
+            part=part,
+        )
+
+
 def _numbers(found: Dataset) -> frozenset[int]:
     """Segment numbers of the object; the background of a label map is none. Call within `tolerant`."""
     numbers = frozenset(int(segment.SegmentNumber) for segment in found.SegmentSequence)
-    is_map = found.SegmentationType == "LABELMAP"
-    return numbers - {int(found.get("PixelPaddingValue") or 0)} if is_map else numbers
+    return numbers - {_background(found)} if found.SegmentationType == "LABELMAP" else numbers
 
 
-def _segments_of_frames(found: Dataset) -> list[int | None]:
+def _background(found: Dataset) -> int:
+    """What a label map holds where there is no segment."""
+    return int(found.get("PixelPaddingValue") or 0)
+
+
+def _segments_of_frames(found: Dataset) -> list[int]:
     shared = (found.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
     name = "SegmentIdentificationSequence"
     return [

@@ -7,6 +7,7 @@ what one held whose lease has run out is taken over by another.
 import logging
 import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ def prepare(url: str) -> None:
     if parsed.get_backend_name() == "sqlite" and parsed.database:
         file = Path(parsed.database)
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with sqlite3.connect(file, timeout=30.0) as connection:
+        with closing(sqlite3.connect(file, timeout=30.0)) as connection:
             connection.execute("PRAGMA journal_mode=WAL")  # readers do not wait for writers; stays with the file
         file.chmod(0o600)
     DBOS.migrate(bounded(url), schema=SCHEMA)
@@ -84,6 +85,19 @@ def prepare(url: str) -> None:
     except sa.exc.DBAPIError:  # another replica was faster
         if not sa.inspect(engine).has_table(_LEASES.name):
             raise
+    finally:
+        engine.dispose()
+
+
+def is_made(url: str) -> bool:
+    """Whether `prepare` has ever been there, as far as the database says; makes nothing."""
+    if not is_postgres(url) and not Path(make_url(url).database or "").is_file():
+        return False
+    engine = open_engine(url)
+    try:
+        return sa.inspect(engine).has_table(_LEASES.name)
+    except sa.exc.DBAPIError:  # it is away, which whoever asks it next is told
+        return True
     finally:
         engine.dispose()
 

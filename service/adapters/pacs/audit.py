@@ -19,6 +19,8 @@ from typing import Any, BinaryIO
 #: What stands for the line before the first.
 GENESIS = "0" * 64
 PROGRAM = "MorphoFlow"
+#: How every line begins.
+BEGINNING = b'{"hash": "'
 
 
 class AuditEvent(Enum):
@@ -78,19 +80,47 @@ class AuditTrail:
             os.fsync(file.fileno())
 
 
-def broken_line(path: Path) -> int | None:
-    """Number of the first line that does not follow from the ones before it; None for a whole trail."""
-    previous = GENESIS
+@dataclass(frozen=True)
+class TrailCheck:
+    """What is found in a trail, by the numbers of its lines from 1.
+
+    Attributes:
+        broken: the first line that does not follow from the whole ones before it; None in an intact trail.
+        torn: lines up to there that are only begun, as a killed process leaves them; those after them follow from the
+            last whole line.
+    """
+
+    broken: int | None
+    torn: tuple[int, ...] = ()
+
+
+def check_trail(path: Path) -> TrailCheck:
+    """Follow the chain of hashes."""
+    previous, torn = GENESIS, list[int]()
     with path.open("rb") as file:
         for number, line in enumerate(file, 1):
-            try:
-                found = json.loads(line)
-                if chained(found["message"], previous) != line or found["previous"] != previous:
-                    return number
-                previous = found["hash"]
-            except (ValueError, KeyError, TypeError):
-                return number
-    return None
+            found = _hash_of(line)
+            if found is None and _is_begun(line):
+                torn.append(number)
+            elif found is None or not _follows(line, previous):
+                return TrailCheck(number, tuple(torn))
+            else:
+                previous = found
+    return TrailCheck(None, tuple(torn))
+
+
+def _is_begun(line: bytes) -> bool:
+    """Whether the beginning of a line is all there is of it."""
+    content = line.removesuffix(b"\n")
+    return content[: len(BEGINNING)] == BEGINNING[: len(content)]
+
+
+def _follows(line: bytes, previous: str) -> bool:
+    """Whether a line is what is written of its message after the line of a hash."""
+    try:
+        return chained(json.loads(line)["message"], previous) == line.removesuffix(b"\n") + b"\n"
+    except (ValueError, KeyError, TypeError):
+        return False
 
 
 def chained(content: dict[str, Any], previous: str) -> bytes:

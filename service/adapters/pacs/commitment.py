@@ -33,10 +33,6 @@ class Report:
         return self.failed is not None and not self.failed
 
 
-#: What listeners of earlier releases write, which may run beside this one.
-_OF_EARLIER_RELEASES = {b"committed": Report(), b"failed": Report(None)}
-
-
 class Reports:
     """Requests that were made and their reports, by Transaction UID."""
 
@@ -61,8 +57,6 @@ class Reports:
             content = self._blobs.get(f"{_folder(transaction)}/report")
         except FileNotFoundError:
             return None
-        if content in _OF_EARLIER_RELEASES:
-            return _OF_EARLIER_RELEASES[content]
         failed = json.loads(content)["failed"]
         return Report(None if failed is None else frozenset(failed))
 

@@ -20,11 +20,13 @@ from service.adapters.pacs.configuration import Archive, PacsConfiguration
 from service.adapters.pacs.inbox import ARGUMENT, IMAGES, INBOX, OBJECT, quarantine
 from service.adapters.pacs.references import referenced_images
 from service.errors import ArchiveUnavailable
-from service.job_ports import BlobStore
+from service.job_ports import BlobStore, Record
 from service.pacs_ports import PictureArchive, Retrieval
 
 #: Beside a drawing: its results, how far archives are that commit themselves to them, and when others took them.
 RESULTS, DELIVERIES, TAKEN = "results", "deliveries", "taken"
+#: Beside a drawing: the moment that all of its results say that they were made at.
+MOMENT = "moment.json"
 #: Wait for an archive to show what it took before it is sent again (s).
 SHOWN_S = 600.0
 #: Wait for a report that comes at once, and between two looks for it (s); later ones are for the turns to come.
@@ -81,6 +83,13 @@ class Desk:
         with quiet():
             return [Dataset.from_json(item) for item in json.loads(self.blobs.get(f"{INBOX}/{identifier}/{IMAGES}"))]
 
+    def moment_s(self, identifier: str) -> float:
+        """When the results of a drawing are made (seconds since 1970): the same for all, also after a restart."""
+        key = f"{INBOX}/{identifier}/{MOMENT}"
+        if not self.blobs.exists(key):
+            self.blobs.put(key, json.dumps(self.now_s()).encode())
+        return float(json.loads(self.blobs.get(key)))
+
     def put_results(self, identifier: str, results: dict[str, Dataset]) -> None:
         """Keep results until they are given back; those that are there stay as they are."""
         for number, (name, found) in enumerate(results.items()):
@@ -112,16 +121,15 @@ class Desk:
         """Put a drawing in quarantine under a name."""
         key = f"{INBOX}/{identifier}/{OBJECT}"
         if self.blobs.exists(key):
-            quarantine(self.blobs, name, self.blobs.get(key), reason, self._labels(identifier))
+            quarantine(self.blobs, name, self.blobs.get(key), reason, self._argument(identifier))
         self.forget(identifier)
 
-    def _labels(self, identifier: str) -> list[int] | None:
-        """Numbers of the segments or regions that the job is about; None for all."""
+    def _argument(self, identifier: str) -> Record:
+        """What the job was told; nothing where a killed process was about to remove the folder."""
         try:
-            found: list[int] | None = json.loads(self.blobs.get(f"{INBOX}/{identifier}/{ARGUMENT}"))["labels"]
-        except FileNotFoundError:  # a killed process was about to remove the folder
-            return None
-        return found
+            return dict(json.loads(self.blobs.get(f"{INBOX}/{identifier}/{ARGUMENT}")))
+        except FileNotFoundError:
+            return {}
 
     def _store(self, opened: PictureArchive, results: Sequence[Dataset], taken: str) -> None:
         """Send what a query does not find, and make sure that it finds it then.

@@ -109,7 +109,7 @@ class DimseArchive:
         ending = Dataset()
         contexts = [sop_classes.FIND, sop_classes.MOVE]
         secure = None if self._archive.tls is None else _readable(server_context, self._archive.tls)
-        port = receiving(target, self._archive.ae_title, _collect(found, query), secure)
+        port = receiving(target, self._archive.ae_title or "", _collect(found, query), secure)
         with port, self._associated(contexts) as peer:
             if self._matches(peer, query):
                 ending = _last(peer.send_c_move(query, target.ae_title, sop_classes.MOVE))

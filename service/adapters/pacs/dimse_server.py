@@ -3,12 +3,12 @@
 An object is acknowledged when it is on disk and in a durable job, never before.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from pydicom import Dataset
-from pynetdicom import AE, evt
+from pynetdicom import evt
 from pynetdicom.presentation import PresentationContext
 
 from service.adapters.dicom.objects import quiet
@@ -16,6 +16,7 @@ from service.adapters.pacs import sop_classes
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome
 from service.adapters.pacs.commitment import Report, Reports
 from service.adapters.pacs.configuration import Listener
+from service.adapters.pacs.listening import ListeningEntity
 from service.adapters.pacs.prompt_sockets import PROMPT
 from service.adapters.pacs.tls import server_context
 from service.job_ports import BlobStore
@@ -23,28 +24,33 @@ from service.pacs_ports import Disposition, ObjectReceiver
 
 #: Status of a C-STORE (PS3.4, GG.4-1).
 SUCCESS, CANNOT_UNDERSTAND, OUT_OF_RESOURCES, PROCESSING_FAILURE = 0x0000, 0xC000, 0xA700, 0x0110
-#: Time that a connection has for its request (s); one that says nothing holds no place for longer.
-REQUEST_S = 5.0
 #: Source of a rejection that is about the calling or the called title (PS3.8, 9.3.4).
 TITLES = 0x01
 
 
 @contextmanager
 def dimse_listener(
-    listener: Listener, receiver: ObjectReceiver, blobs: BlobStore, audit: AuditTrail, log: Any
+    listener: Listener,
+    receiver: ObjectReceiver,
+    blobs: BlobStore,
+    audit: AuditTrail,
+    log: Any,
+    turned_away: Callable[[], object],
 ) -> Iterator[None]:
-    """Accept associations while the context lasts."""
-    entity: Any = AE(ae_title=listener.ae_title)
-    entity.maximum_associations, entity.acse_timeout = listener.maximum_associations, REQUEST_S
-    entity.require_called_aet = True
-    entity.require_calling_aet = list(listener.calling_ae_titles)
+    """Accept associations while the context lasts.
+
+    Args:
+        turned_away: called for each association that is one too many.
+    """
+    callers = listener.calling_ae_titles
+    entity: Any = ListeningEntity(listener.ae_title, callers, listener.maximum_associations)
     entity.add_supported_context(sop_classes.VERIFICATION)
     for uid in sop_classes.RECEIVED:
         entity.add_supported_context(uid, list(sop_classes.ACCEPTED_SYNTAXES))
     for uid in sop_classes.LEFT_ALONE:
         entity.add_supported_context(uid, list(sop_classes.LEFT_ALONE_SYNTAXES))
     entity.add_supported_context(sop_classes.COMMITMENT, scu_role=True, scp_role=True)
-    desk = _Desk(listener, receiver, blobs, audit, log)
+    desk = _Desk(listener, receiver, blobs, audit, log, turned_away)
     handlers: list[Any] = [
         PROMPT,
         (evt.EVT_C_ECHO, lambda event: SUCCESS),
@@ -79,13 +85,20 @@ class _Desk:
     """What is done with what peers send."""
 
     def __init__(
-        self, listener: Listener, receiver: ObjectReceiver, blobs: BlobStore, audit: AuditTrail, log: Any
+        self,
+        listener: Listener,
+        receiver: ObjectReceiver,
+        blobs: BlobStore,
+        audit: AuditTrail,
+        log: Any,
+        turned_away: Callable[[], object],
     ) -> None:
         self._title = listener.ae_title
         self._receiver = receiver
         self._reports = Reports(blobs)
         self._audit = audit
         self._log = log
+        self._turned_away = turned_away
 
     def store(self, event: Any) -> int:
         """C-STORE: the status that the sender is told."""
@@ -113,8 +126,9 @@ class _Desk:
         return SUCCESS, None
 
     def rejected(self, event: Any) -> None:
-        """An association of somebody who is not on the list, or one too many; the former is an alert."""
+        """An association of somebody who is not on the list, which is an alert; or one too many, which is counted."""
         if event.assoc.acceptor.primitive.result_source != TITLES:
+            self._turned_away()
             self._log.warning("association turned away", reason="as many associations as are accepted are open")
             return
         caller = event.assoc.requestor.ae_title.strip()

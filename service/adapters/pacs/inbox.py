@@ -47,22 +47,46 @@ class Inbox:
 
     def receive(self, data: bytes, sender: str, study: str | None = None) -> Receipt:
         """Take one object; see `ObjectReceiver`."""
-        header, digest = header_of(data), hashlib.sha256(data).hexdigest()
+        header = header_of(data)
         if study is not None and header.study not in ("", study):
             return self._misplaced(header, sender)
         if header.is_foreign:
             return self._taken(header, sender, None)
+        receipt, _ = self._take(data, sender, sender)
+        return receipt
+
+    def send_again(self, name: str) -> Disposition:
+        """Take an object in quarantine once more, as if its sender had sent it again; by the name of its folder.
+
+        Raises:
+            FileNotFoundError: none of that name is in quarantine.
+        """
+        data = self.blobs.get(f"{QUARANTINE}/{name}/{OBJECT}")
+        told = json.loads(self.blobs.get(f"{QUARANTINE}/{name}/{REASON}"))
+        receipt, drawings = self._take(data, told.get("sender", ""), self.title)
+        if receipt.disposition is Disposition.ACCEPTED and name not in drawings:  # by a rule of another name
+            self.blobs.delete(f"{QUARANTINE}/{name}/")
+        return receipt.disposition
+
+    def _take(self, data: bytes, sender: str, source: str) -> tuple[Receipt, list[str]]:
+        """Make a job of each structure that a rule takes; their names in quarantine, should they come to be there.
+
+        Args:
+            sender: whom the rules ask about.
+            source: who gave the object, in the audit trail.
+        """
         try:
             found = read_object(io.BytesIO(data), "object")
             with tolerant("object"):
                 named = (str(found.SOPClassUID), str(found.SOPInstanceUID), str(found.StudyInstanceUID))
             match = find_rule(self.rules, found, sender)
         except InputError as error:
-            return self._quarantine(data, digest, sender, error)
+            return self._quarantine(data, sender, source, error), []
+        drawings = []
         if match is not None:
             for labels, name in zip(match.structures, drawing_digests(found, match), strict=True):
-                self._accept(data, name, match.rule, labels)
-        return self._taken(Header(*named, is_foreign=match is None), sender, match)
+                drawings.append(self._accept(data, name, match.rule, labels, sender))
+        return self._taken(Header(*named, is_foreign=match is None), source, match), drawings
 
     def take_up(self) -> None:
         """Make jobs of what a killed service had written down and not enqueued; its sender was not told anything."""
@@ -77,13 +101,17 @@ class Inbox:
 
     def quarantined(self) -> int:
         """Objects in quarantine."""
-        return len({key.split("/")[2] for key in self.blobs.list(f"{QUARANTINE}/")})
+        return len(self.in_quarantine())
 
-    def _taken(self, header: Header, sender: str, match: Match | None) -> Receipt:
+    def in_quarantine(self) -> list[str]:
+        """Names of the folders in quarantine."""
+        return sorted({key.split("/")[2] for key in self.blobs.list(f"{QUARANTINE}/")})
+
+    def _taken(self, header: Header, source: str, match: Match | None) -> Receipt:
         disposition = Disposition.LEFT_ALONE if match is None else Disposition.ACCEPTED
         note = "" if match else "No rule takes it; it was left alone."
         uids = (header.sop_class, header.sop_instance)
-        self.audit.write(AuditEntry(AuditEvent.RECEIVED, sender, self.title, header.study, [uids], note=note))
+        self.audit.write(AuditEntry(AuditEvent.RECEIVED, source, self.title, header.study, [uids], note=note))
         self.log.info("object received", disposition=disposition.value, rule=match.rule.name if match else None)
         return Receipt(disposition, *uids)
 
@@ -94,8 +122,12 @@ class Inbox:
         self.log.warning("object received", disposition=Disposition.MISPLACED.value)
         return Receipt(Disposition.MISPLACED, *uids)
 
-    def _accept(self, data: bytes, digest: str, rule: Rule, labels: frozenset[int] | None) -> None:
-        """On disk first, then the job; what a job is at work on, or has given back the results of, is left to it."""
+    def _accept(self, data: bytes, digest: str, rule: Rule, labels: frozenset[int] | None, sender: str) -> str:
+        """On disk first, then the job; what a job is at work on, or has given back the results of, is left to it.
+
+        Returns:
+            The name of the drawn structure in quarantine.
+        """
         drawing = self.jobs.new_id(DRAWING_JOB, digest)
         fruitless: list[str] = []
         for identifier in self._identifiers(digest):
@@ -103,19 +135,21 @@ class Inbox:
             if status is None:
                 break
             if not self._is_fruitless(status, drawing):
-                return
+                return drawing
             fruitless.append(identifier)
         argument: Record = {
             "object": identifier,
             "drawing": drawing,
             "rule": rule.name,
             "labels": None if labels is None else sorted(labels),
+            "sender": sender,
             "send_to": list(rule.send_to),
         }
         self.blobs.put(f"{INBOX}/{identifier}/{OBJECT}", data)
         self.blobs.put(f"{INBOX}/{identifier}/{ARGUMENT}", json.dumps(argument).encode())
         self.jobs.enqueue(DRAWING_JOB, argument, identifier)
         self._release(drawing, fruitless)
+        return drawing
 
     def _identifiers(self, digest: str) -> Iterator[str]:
         """Of the first job of a drawn structure, and of those that follow one without results."""
@@ -146,17 +180,22 @@ class Inbox:
         except UnknownJob:
             return None
 
-    def _quarantine(self, data: bytes, digest: str, sender: str, error: InputError) -> Receipt:
-        quarantine(self.blobs, digest, data, str(error))
-        entry = AuditEntry(AuditEvent.RECEIVED, sender, self.title, outcome=Outcome.MINOR_FAILURE, note=str(error))
+    def _quarantine(self, data: bytes, sender: str, source: str, error: InputError) -> Receipt:
+        quarantine(self.blobs, hashlib.sha256(data).hexdigest(), data, str(error), {"sender": sender})
+        entry = AuditEntry(AuditEvent.RECEIVED, source, self.title, outcome=Outcome.MINOR_FAILURE, note=str(error))
         self.audit.write(entry)
         self.log.warning("object quarantined", reason=str(error))
         return Receipt(Disposition.QUARANTINED)
 
 
-def quarantine(blobs: BlobStore, name: str, data: bytes, reason: str, labels: Sequence[int] | None = None) -> None:
-    """Put an object aside with the reason, and the numbers of the segments or regions that it is about."""
-    about = {} if labels is None else {"segments": list(labels)}
+def quarantine(blobs: BlobStore, name: str, data: bytes, reason: str, argument: Record) -> None:
+    """Put an object aside with the reason.
+
+    Args:
+        argument: of its job, as far as it got one: who sent it, and the segments or regions that it is about.
+    """
+    labels = argument.get("labels")
+    about = {"sender": argument.get("sender", ""), **({} if labels is None else {"segments": labels})}
     blobs.put(f"{QUARANTINE}/{name}/{OBJECT}", data)
     blobs.put(f"{QUARANTINE}/{name}/{REASON}", json.dumps({"reason": reason, **about}).encode())
 

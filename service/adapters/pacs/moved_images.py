@@ -9,23 +9,25 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pynetdicom import AE, StoragePresentationContexts, evt
+from pynetdicom import evt
 
 from service.adapters.pacs import sop_classes
 from service.adapters.pacs.configuration import MoveDestination
+from service.adapters.pacs.listening import ListeningEntity
 from service.adapters.pacs.prompt_sockets import PROMPT
+
+#: Associations in which an archive sends the images of one series at the same time.
+MOST_ASSOCIATIONS = 10
 
 
 @contextmanager
 def receiving(
-    target: MoveDestination, sender: str | None, handler: Callable[[Any], int], secure: ssl.SSLContext | None
+    target: MoveDestination, sender: str, handler: Callable[[Any], int], secure: ssl.SSLContext | None
 ) -> Iterator[None]:
     """The port is open for one calling title, and for nobody else; others on this machine wait until it is closed."""
-    entity: Any = AE(ae_title=target.ae_title)
-    entity.require_called_aet = True
-    entity.require_calling_aet = [sender]
-    for context in StoragePresentationContexts:
-        entity.add_supported_context(context.abstract_syntax, list(sop_classes.IMAGE_SYNTAXES))
+    entity: Any = ListeningEntity(target.ae_title, [sender], MOST_ASSOCIATIONS)
+    for uid in sop_classes.STORAGE:
+        entity.add_supported_context(uid, list(sop_classes.IMAGE_SYNTAXES))
     handlers = [PROMPT, (evt.EVT_C_STORE, handler)]
     address = (target.host, target.port)
     with _alone_on(target.port):

@@ -1,6 +1,7 @@
 """Studies as training data without identifiers; trails that are whole."""
 
 import copy
+import hashlib
 import io
 import json
 import shutil
@@ -13,8 +14,10 @@ from pydicom.encaps import encapsulate
 from pydicom.sequence import Sequence as Items
 from pydicom.uid import JPEG2000Lossless, MediaStorageDirectoryStorage
 
+from service.adapters.blobs import FolderBlobs
 from service.adapters.dicom.profile import apply_profile
-from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail
+from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, TrailCheck, check_trail
+from service.adapters.pacs.inbox import ARGUMENT, INBOX, QUARANTINE, quarantine
 from service.cli import main
 from tests.dicom_parts import (
     PATIENT_ID,
@@ -101,10 +104,70 @@ def test_a_whole_trail_and_a_broken_one(tmp_path, capsys):
         AuditTrail(path).write(AuditEntry(AuditEvent.STARTED, "A", "A"))
     assert main(["audit", str(path)]) == 0
     assert "whole" in capsys.readouterr().out
-    path.write_bytes(path.read_bytes()[300:])
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-40])
+    assert main(["audit", str(path)]) == 0
+    told = capsys.readouterr()
+    assert "line 3" in told.err
+    assert "whole" in told.out
+    path.write_bytes(whole[300:])
     assert main(["audit", str(path)]) == 2
     assert "line 1" in capsys.readouterr().err
     assert main(["audit", str(tmp_path / "none")]) == 2
+
+
+RULES = """
+[[archives]]
+name = "a"
+dicomweb = "http://127.0.0.1:1/dicom-web"
+[[rules]]
+name = "one"
+model = "hippocampus"
+segment_labels = ["hippo*"]
+senders = ["VIEWER"]
+fetch_from = "a"
+send_to = ["a"]
+"""
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """Files of a service among archives."""
+    (tmp_path / "pacs.toml").write_text(RULES)
+    monkeypatch.setenv("MORPHOFLOW_PACS_FILE", str(tmp_path / "pacs.toml"))
+    monkeypatch.setenv("MORPHOFLOW_RESULTS_FOLDER", str(tmp_path / "results"))
+    return FolderBlobs(tmp_path / "files")
+
+
+@pytest.fixture(scope="module")
+def pair() -> bytes:
+    """A drawing of a left and a right structure."""
+    values = np.zeros((*SIZE, 2), np.uint8)
+    values[2:6, 3:10, 2:6, 0] = values[9:13, 3:10, 2:6, 1] = 1
+    return file_bytes(seg_of(mr_series(SIZE), values, labels=("hippo left", "hippo right")))
+
+
+def test_drawings_in_quarantine_are_taken_up_again(files, pair, tmp_path, capsys):
+    quarantine(files, "a", pair, "The archive refused a result.", {"sender": "VIEWER"})
+    quarantine(files, "b", pair, "The archive refused a result.", {"sender": "NOBODY"})
+    damaged = hashlib.sha256(b"nonsense").hexdigest()
+    quarantine(files, damaged, b"nonsense", "It is damaged.", {"sender": "VIEWER"})
+    assert main(["resend", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"taken": ["a"], "left": sorted(["b", damaged])}
+    asked = [json.loads(files.get(key)) for key in files.list(f"{INBOX}/") if key.endswith(ARGUMENT)]
+    assert {key.split("/")[2] for key in files.list(f"{QUARANTINE}/")} == {"b", damaged}
+    assert sorted((job["labels"], job["sender"]) for job in asked) == [([1], "VIEWER"), ([2], "VIEWER")]
+    assert check_trail(tmp_path / "audit.jsonl") == TrailCheck(None)
+
+
+def test_slips_of_resend_are_told(files, pair, monkeypatch, capsys):
+    quarantine(files, "a", pair, "The archive refused a result.", {"sender": "VIEWER"})
+    assert main(["resend", "a", "none"]) == 2
+    assert "no folder none" in capsys.readouterr().err
+    assert list(files.list(f"{INBOX}/")) == []
+    monkeypatch.delenv("MORPHOFLOW_PACS_FILE")
+    assert main(["resend"]) == 2
+    assert "MORPHOFLOW_PACS_FILE" in capsys.readouterr().err
 
 
 def test_the_profile_keeps_segmentations_valid(study, output, tmp_path):

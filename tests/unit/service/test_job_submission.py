@@ -40,6 +40,16 @@ class FullBlobs(FolderBlobs):
         super().put_file(key, file)
 
 
+class AwayBlobs(FolderBlobs):
+    """Storage that takes nothing, and removes nothing."""
+
+    def put_file(self, key, file):  # noqa: ARG002
+        raise OSError("The object storage does not answer.")
+
+    def delete(self, prefix):  # noqa: ARG002
+        raise OSError("The object storage does not answer.")
+
+
 class Upload(io.BytesIO):
     """A file of which no more than a piece may be in memory."""
 
@@ -92,6 +102,12 @@ def test_inputs_that_cannot_be_kept_take_none_of_another_submission(jobs, tmp_pa
     assert len(list(blobs.list("jobs/"))) == 2
 
 
+def test_a_storage_that_is_away_is_told_as_one_for_later(jobs, tmp_path):
+    with pytest.raises(StoreFull, match="later"):
+        JobDesk(jobs, AwayBlobs(tmp_path), 64).submit(RECONSTRUCTION_JOB, {"masks": 1}, sent(b"1"), model="m@1")
+    assert jobs.unfinished() == 0
+
+
 def test_what_is_sent_is_kept_piece_by_piece(jobs, tmp_path):
     content = bytes(range(256)) * 20_000
     made = JobDesk(jobs, FolderBlobs(tmp_path), 64).submit(
@@ -108,3 +124,29 @@ def test_a_request_sent_again_after_a_new_version_of_its_model_leads_to_its_job(
     assert (again.id, again.argument["model"]) == (first.id, "m@1")
     with pytest.raises(InvalidParameter):
         desk.submit(RECONSTRUCTION_JOB, {**asked, "model": "m@2"}, sent(b"1"), "one", model="m@2")
+
+
+class FullJobs(DbosJobs):
+    """A database without room for one more job."""
+
+    def enqueue(self, *_):
+        raise StoreFull("The jobs' database has no room for the job.")
+
+
+@pytest.mark.parametrize("key", [None, "one"])
+def test_a_job_that_cannot_be_kept_leaves_nothing_of_what_was_sent(sqlite_url, tmp_path, key):
+    jobs, blobs = FullJobs(sqlite_url), FolderBlobs(tmp_path / "files")
+    with pytest.raises(StoreFull):
+        JobDesk(jobs, blobs, 64).submit(RECONSTRUCTION_JOB, {"masks": 1}, sent(b"1"), key, model="m@1")
+    assert list(blobs.list("jobs/")) == []
+    jobs.close()
+
+
+def test_the_earlier_job_of_a_key_is_found_for_the_same_request_alone(jobs, tmp_path):
+    desk = JobDesk(jobs, FolderBlobs(tmp_path), 64)
+    assert desk.earlier(RECONSTRUCTION_JOB, {"masks": 1}, sent(b"1"), "one") is None
+    made = desk.submit(RECONSTRUCTION_JOB, {"masks": 1}, sent(b"1"), "one", model="m@1")
+    assert desk.earlier(RECONSTRUCTION_JOB, {"masks": 1}, sent(b"1"), "one") == made
+    assert desk.earlier(RECONSTRUCTION_JOB, {"masks": 1}, sent(b"1"), None) is None
+    with pytest.raises(InvalidParameter):
+        desk.earlier(RECONSTRUCTION_JOB, {"masks": 1}, sent(b"2"), "one")

@@ -2,14 +2,17 @@
 
 import errno
 import gc
+import os
 import shutil
 import weakref
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from model.errors import BundleCorrupt, BundleIncomplete, InvalidParameter, UnknownModel
 from service.model_registry import MANIFEST, ModelRegistry, OpenedOnce, find_bundles, load_models, load_registry
+from service.schemas import BrokenModelSchema
 from service.settings import Settings
 from tests.analytic_model import ellipsoid_model
 
@@ -160,3 +163,29 @@ def test_models_are_kept_while_the_program_has_no_more_files_to_open(tmp_path):
     with pytest.raises(OSError, match="Too many"):
         registry.refresh()
     assert registry.names() == ("hip",)
+
+
+def test_a_bundle_that_is_broken_by_now_takes_no_memory_and_is_tried_again(tmp_path):
+    tries = iter(range(3))
+
+    def open_model(_):
+        if next(tries) == 1:
+            raise BundleCorrupt("weights.onnx differs.")
+        return versioned("1.0.0")
+
+    once = OpenedOnce(open_model)
+    (tmp_path / MANIFEST).write_text("{}")
+    first = weakref.ref(once(tmp_path))
+    (tmp_path / MANIFEST).write_text("{} ")
+    with pytest.raises(BundleCorrupt):
+        once(tmp_path)
+    gc.collect()
+    assert first() is None
+    assert once(tmp_path).manifest.version == "1.0.0"
+
+
+def test_a_name_that_is_no_text_is_told_as_one_that_can_be_sent():
+    folder = Path(os.fsdecode(b"bone\xff"))
+    (broken,) = load_models([folder], opener({folder.name: BundleIncomplete("It lacks \ud800.")})).broken
+    assert (broken.name, broken.reason) == ("bone?", "It lacks ?.")
+    assert BrokenModelSchema(name=broken.name, reason=broken.reason).model_dump_json()

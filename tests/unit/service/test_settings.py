@@ -64,6 +64,8 @@ def test_lists_in_the_file_are_lists(tmp_path, monkeypatch):
         ("JOBS_DATABASE", "mysql://user:hush@host/name"),
         ("JOBS_DATABASE", "postgresql://user:hush@host:port/name"),
         ("JOBS_DATABASE", "postgresql://user:hush@host"),
+        ("JOBS_DATABASE", "sqlite://"),
+        ("JOBS_DATABASE", "sqlite:///:memory:"),
         ("STORAGE_URL", "bucket"),
         ("STORAGE_URL", "s3://"),
         ("STORAGE_URL", "https://bucket.example.org"),

@@ -1,6 +1,6 @@
 /** Voxel grids in the world: which voxel axes an anatomical plane has, and how it lies on the screen. */
 
-import type { DrawnPlane, Grid, Vec3 } from './types'
+import type { DrawnPlane, Grid, Row, Vec3 } from './types'
 
 export type PlaneName = 'axial' | 'coronal' | 'sagittal'
 export const PLANES: PlaneName[] = ['axial', 'coronal', 'sagittal']
@@ -110,19 +110,33 @@ export function voxelAt(grid: Grid, layout: Layout, slice: number, x: number, y:
   return index
 }
 
+/** What is drawn on a plane, row by row. */
+export function* rowsOf(grid: Grid, plane: DrawnPlane): Generator<Row> {
+  const [first, along] = [0, 1, 2].filter((axis) => axis !== plane.axis) as [number, number]
+  const width = grid.shape[along]!
+  for (const [start, count] of plane.runs) {
+    for (let at = start, left = count; left > 0; ) {
+      const length = Math.min(left, width - (at % width))
+      const from: Vec3 = [0, 0, 0]
+      from[plane.axis] = plane.index
+      from[first] = Math.floor(at / width)
+      from[along] = at % width
+      yield { from, along, length }
+      at += length
+      left -= length
+    }
+  }
+}
+
 /** Voxels that are drawn on a plane. */
-export function voxelsOf(grid: Grid, plane: DrawnPlane): Vec3[] {
-  const [first, second] = [0, 1, 2].filter((axis) => axis !== plane.axis) as [number, number]
-  const width = grid.shape[second]!
-  return plane.runs.flatMap(([start, length]) =>
-    Array.from({ length }, (_, n) => {
-      const index: Vec3 = [0, 0, 0]
-      index[plane.axis] = plane.index
-      index[first] = Math.floor((start + n) / width)
-      index[second] = (start + n) % width
-      return index
-    }),
-  )
+export function* voxelsOf(grid: Grid, plane: DrawnPlane): Generator<Vec3> {
+  for (const { from, along, length } of rowsOf(grid, plane)) {
+    for (let n = 0; n < length; n += 1) {
+      const index: Vec3 = [...from]
+      index[along]! += n
+      yield index
+    }
+  }
 }
 
 /** For each world axis the voxel axis that runs along it most closely; each is taken once. */

@@ -1,6 +1,6 @@
 /** The choice among the loaded models. */
 
-import { type Api, Refusal } from './api'
+import { type Api, Refusal, sentence } from './api'
 import { option } from './dom'
 import type { Status } from './status'
 import { T } from './text'
@@ -14,14 +14,15 @@ const AGAIN_MS = 2000
 
 /** The loaded models, once the service answers; until then it is told that it does not. */
 export async function loadedModels(api: Api, status: Status): Promise<ModelSummary[]> {
-  for (let told = ''; ; ) {
+  for (;;) {
     try {
       const models = await api.models()
-      status.recover(told)
+      status.hinder('')
       return models
     } catch (fault) {
-      if (!(fault instanceof Refusal && fault.isPassing)) throw fault
-      status.fail((told = fault.message))
+      const passes = fault instanceof Refusal && fault.isPassing
+      status.hinder(passes ? sentence(fault) : '')
+      if (!passes) throw fault
     }
     await new Promise((resolve) => setTimeout(resolve, AGAIN_MS))
   }

@@ -155,8 +155,11 @@ export class Pane {
 export function outline(context: CanvasRenderingContext2D, pane: Pane, belongs: (voxel: number) => boolean, colour: string): void {
   const { grid, layout, slice, view } = pane
   const [width, height] = pane.size
-  const holds = (x: number, y: number): boolean =>
-    x >= 0 && y >= 0 && x < width && y < height && belongs(voxelNumber(grid, voxelAt(grid, layout, slice, x, y)))
+  const held = new Uint8Array(width * height)
+  for (let n = 0; n < held.length; n += 1) {
+    held[n] = belongs(voxelNumber(grid, voxelAt(grid, layout, slice, n % width, Math.floor(n / width)))) ? 1 : 0
+  }
+  const holds = (x: number, y: number): boolean => x >= 0 && y >= 0 && x < width && y < height && held[x + width * y] === 1
   context.strokeStyle = colour
   context.lineWidth = 2
   context.beginPath()

@@ -30,7 +30,8 @@ function placeOf({ stacks }: Sent, stack: number, axis: number, index: number): 
   return T.place.onPlane(T.plane[planeName(grid, axis)], index + 1, grid.shape[axis]!)
 }
 
-function fileOf({ stacks, files }: Sent, stack: number): string {
+/** The file that a stack was read from, as its sender named it. */
+export function fileOf({ stacks, files }: Sent, stack: number): string {
   const part = stacks?.[stack]?.part
   const number = part ? Number(NUMBER.exec(part)?.[0] ?? stack) : stack
   return files[number] ?? T.place.file(number + 1)

@@ -7,11 +7,12 @@ export class Status {
   readonly element = h('div', { class: 'status' })
   private readonly said = h('p', { role: 'status' })
   private readonly wrong = h('p', { role: 'alert' })
+  private readonly hindrance = h('p', { role: 'alert' })
   private readonly waiting = h('div', { class: 'waiting', hidden: true })
   private timer = 0
 
   constructor() {
-    this.element.append(this.waiting, this.said, this.wrong)
+    this.element.append(this.waiting, this.said, this.wrong, this.hindrance)
   }
 
   say(text: string): void {
@@ -23,12 +24,17 @@ export class Status {
   fail(text: string): void {
     this.stop()
     this.said.textContent = ''
-    this.wrong.textContent = text
+    this.wrong.textContent = text === this.hindrance.textContent ? '' : text
   }
 
   /** What went wrong is over; anything else that is said stays. */
-  recover(text: string): void {
-    if (this.wrong.textContent === text) this.wrong.textContent = ''
+  recover(): void {
+    this.wrong.textContent = ''
+  }
+
+  /** What stands in the way, told until it is taken back with an empty text; whatever else goes on is left alone. */
+  hinder(text: string): void {
+    if (this.hindrance.textContent !== text) this.hindrance.textContent = text
   }
 
   /** Steps with a bar and the time so far; `cancel` stops the work. */

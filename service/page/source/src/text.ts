@@ -44,7 +44,7 @@ export const T = {
     text: 'Give a mask with some slices drawn, and get a closed surface, a dense segmentation, and a map of how far to trust it.',
     run: 'Show me: reconstruct the example',
     steps: [
-      'Drop a mask on the left. Slices without drawing may stay empty.',
+      'Drop a mask, or choose its file. Slices without drawing may stay empty.',
       'See which planes the service takes as drawn, and send.',
       'Turn the surface; its colour says how uncertain each place is.',
     ],
@@ -94,7 +94,6 @@ export const T = {
     summary: (count: number, kinds: string, size: string, spacing: number) =>
       `${count} planes count as looked at (${kinds}), on a grid of ${size} voxels, at most ${spacing.toFixed(2)} mm apart.`,
     hint: 'Dashed lines show where other annotated planes cross. Above, the same planes in space.',
-    part: (part: string) => part.replace('mask[', 'File ').replace(']', '').replace(/\d+/, (n) => String(Number(n) + 1)),
     stack: 'Which file is shown',
     ready: (count: number) => `${count} annotated planes found. Ready to send.`,
   },
@@ -253,6 +252,7 @@ export const T = {
     run: 'Compare',
     working: 'Measuring…',
     needTwo: 'Choose two results: those made in this tab are offered, links work as well.',
+    needOther: 'Both are the same result; choose another one to compare it with.',
     legend: 'Signed distance',
     finding: (mean: number, most: number) => `Distance ${mean.toFixed(2)} mm on average, ${most.toFixed(2)} mm at most.`,
   },

@@ -19,6 +19,13 @@ export interface DrawnPlane extends Plane {
   runs: [number, number][]
 }
 
+/** Voxels beside each other along an axis. */
+export interface Row {
+  from: Vec3
+  along: number
+  length: number
+}
+
 export interface Stack extends Grid {
   part: string
 }

@@ -32,6 +32,8 @@ void main() {
   color = vec4(min(vClr.rgb * light, 1.0), opacity);
 }`
 const START: [number, number] = [130, 20]
+/** Shapes are smaller where the view is narrow, so that they do not reach beyond its sides. */
+const NARROW_SIZE = 0.78
 const NAMES = ['surface', 'planes', 'frame']
 
 export class SurfaceView {
@@ -45,6 +47,7 @@ export class SurfaceView {
   private look = PLAIN_LOOK
   private shader = 0
   private readonly size: number
+  private narrow = false
 
   constructor(label: string, options: { cube?: boolean; size?: number } = {}) {
     this.canvas = h('canvas', { tabindex: 0, role: 'img', 'aria-label': `${label} ${T.turnByKeys}` })
@@ -70,6 +73,7 @@ export class SurfaceView {
   async show(surface: Surface | null, look: Look, planes: Surface | null = null, frame: Surface | null = null): Promise<void> {
     Object.assign(this, { surface, look, planes, frame })
     await this.start()
+    this.fit()
     this.draw()
   }
 
@@ -91,8 +95,15 @@ export class SurfaceView {
   }
 
   reset(): void {
-    this.niivue.setScale(this.size)
+    this.niivue.setScale(this.size * (this.narrow ? NARROW_SIZE : 1))
     this.niivue.setRenderAzimuthElevation(...START)
+  }
+
+  private fit(): void {
+    const narrow = this.canvas.clientWidth < this.canvas.clientHeight
+    if (narrow === this.narrow) return
+    this.narrow = narrow
+    this.reset()
   }
 
   /** Turn and size of another view follow this one's, and the other way round. */

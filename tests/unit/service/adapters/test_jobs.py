@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import psycopg
 import pytest
@@ -16,7 +17,7 @@ from sqlalchemy.exc import ProgrammingError
 from benchmarks.ports import free_port
 from model.errors import InvalidMask
 from service.adapters.jobs.client import DbosJobs
-from service.adapters.jobs.database import Leases, bounded
+from service.adapters.jobs.database import Leases, bounded, is_made
 from service.adapters.jobs.worker import WorkerOptions, running_worker
 from service.errors import Overloaded, StoreFull, UnknownJob
 from service.job_ports import JobKind, JobState, JobStatus
@@ -24,7 +25,7 @@ from service.observability import make_log
 from tests.small_disks import fill, small_disk
 
 
-def squares(seen: list[int], fail: tuple[int, ...] = ()) -> JobKind:
+def squares(seen: list[int], fail: tuple[int, ...] = (), fault: Exception | None = None) -> JobKind:
     def follow(run, argument):
         run.expect(argument["count"])
         answers = run.spread("square", [{"x": x} for x in range(argument["count"])])
@@ -34,7 +35,7 @@ def squares(seen: list[int], fail: tuple[int, ...] = ()) -> JobKind:
         check()
         seen.append(item["x"])
         if item["x"] in fail and seen.count(item["x"]) == 1:
-            raise OSError("The disk is full.")
+            raise fault or OSError("The disk is full.")
         return {"y": item["x"] ** 2}
 
     return JobKind("squares", follow, {"square": square})
@@ -66,12 +67,14 @@ def test_the_same_key_is_the_same_job(sqlite_url):
     jobs = DbosJobs(sqlite_url)
     first, again = jobs.new_id("squares", "mine"), jobs.new_id("squares", "mine")
     assert first == again != jobs.new_id("squares", "yours") != jobs.new_id("squares")
+    assert first != jobs.new_id("cubes", "mine")
     jobs.enqueue("squares", {"count": 3}, first)
     assert jobs.enqueue("squares", {"count": 9}, again).argument == {"count": 3}
     jobs.close()
 
 
-def test_a_failing_disk_is_tried_again_and_an_input_at_fault_is_told(sqlite_url):
+@pytest.mark.parametrize("fault", [OSError("The object storage refused the request."), StoreFull("It is full.")])
+def test_a_storage_that_refuses_for_a_while_is_tried_again_and_an_input_at_fault_is_told(sqlite_url, fault):
     def refuse(_item, _check):
         raise InvalidMask("The mask has no foreground.", part="mask")
 
@@ -80,7 +83,7 @@ def test_a_failing_disk_is_tried_again_and_an_input_at_fault_is_told(sqlite_url)
     first, second = jobs.new_id("squares"), jobs.new_id("refusing")
     jobs.enqueue("squares", {"count": 3}, first)
     jobs.enqueue("refusing", {}, second)
-    with running_worker([squares(seen, fail=(1,)), refusing], WorkerOptions(sqlite_url, "a-0")):
+    with running_worker([squares(seen, (1,), fault), refusing], WorkerOptions(sqlite_url, "a-0")):
         assert awaited(jobs, first).result == {"sum": 5}
         status = awaited(jobs, second)
     assert seen.count(1) == 2
@@ -204,6 +207,22 @@ def test_what_is_no_identifier_names_no_job(url, name):
         with pytest.raises(UnknownJob):
             ask(name)
     jobs.close()
+
+
+def test_a_database_is_made_when_it_is_used_and_not_by_asking_whether_it_is(url):
+    jobs = DbosJobs(url)
+    assert [is_made(url), is_made(url)] == [False, False]
+    jobs.unfinished()
+    assert is_made(url)
+    jobs.close()
+
+
+def test_nothing_of_a_database_stays_open(sqlite_url):
+    jobs, file = DbosJobs(sqlite_url), make_url(sqlite_url).database
+    assert jobs.unfinished() == 0
+    assert is_made(sqlite_url)
+    jobs.close()
+    assert not [link for link in Path("/proc/self/fd").iterdir() if str(link.resolve()).startswith(file)]
 
 
 def test_a_silent_peer_is_bounded_and_what_an_address_says_stays():

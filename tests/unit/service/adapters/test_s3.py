@@ -8,6 +8,7 @@ import pytest
 
 pytest.importorskip("boto3")
 
+from model.errors import InvalidParameter
 from service.adapters.blob_results import BlobResultStore
 from service.adapters.s3 import S3Blobs
 from service.errors import StoreFull
@@ -55,9 +56,12 @@ def blobs(monkeypatch):
         lambda blobs: blobs.put_file("place", io.BytesIO(b"1")),
         lambda blobs: blobs.put_file("place", io.BytesIO(bytes(9 << 20))),
         lambda blobs: blobs.get("place"),
+        lambda blobs: blobs.exists("place"),
         lambda blobs: list(blobs.list("place/")),
+        lambda blobs: list(blobs.folders("place/")),
+        lambda blobs: blobs.delete("place/"),
     ],
-    ids=["bytes", "file", "file in pieces", "get", "list"],
+    ids=["bytes", "file", "file in pieces", "get", "exists", "list", "folders", "delete"],
 )
 def test_a_refusal_is_a_failure_of_the_medium(blobs, call):
     with pytest.raises(OSError, match="object storage refused") as caught:
@@ -69,3 +73,11 @@ def test_a_refusal_is_a_failure_of_the_medium(blobs, call):
 def test_a_result_that_storage_refuses_is_one_for_later(blobs):
     with pytest.raises(StoreFull):
         BlobResultStore(blobs, lifetime_s=10.0).save(outcome_of())
+
+
+@pytest.mark.parametrize(("name", "value"), [("AWS_PROFILE", "absent"), ("AWS_DEFAULT_REGION", "no region")])
+def test_surroundings_that_no_client_can_be_made_in_are_told_in_a_sentence(blobs, monkeypatch, name, value):  # noqa: ARG001
+    monkeypatch.setenv(name, value)
+    with pytest.raises(InvalidParameter, match=name) as caught:
+        S3Blobs("s3://bucket", None)
+    assert value not in str(caught.value)

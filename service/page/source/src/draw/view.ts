@@ -83,14 +83,15 @@ export class DrawView {
     return this.pens.map((pen) => pen.pane)
   }
 
-  /** A new drawing on an image's grid, or on an empty one that fits the model. */
-  private async begin(image: File | null): Promise<void> {
+  /** A new drawing on an image's grid, or on an empty one that fits the model, unless it is no longer wanted then. */
+  private async begin(image: File | null, wanted: () => boolean = () => true): Promise<void> {
     this.beginning.abort()
     this.beginning = new AbortController()
     const { signal } = this.beginning
     try {
       const sheet = await this.sheetOf(image, signal)
       signal.throwIfAborted()
+      if (!wanted()) return
       this.sheets.begin(sheet)
       this.showSheet(sheet)
       this.status.say(this.hint())
@@ -107,7 +108,7 @@ export class DrawView {
 
   /** What is drawn is fitted by the other model; where nothing is, there is a new grid that fits it. */
   private async changeModel(): Promise<void> {
-    if (this.sheets.isBlank) await this.begin(null)
+    if (this.sheets.isBlank) await this.begin(null, () => this.sheets.isBlank)
     else {
       this.clearSurface()
       await this.update()
@@ -218,6 +219,7 @@ export class DrawView {
     const scale = surface.scalars && scaleFromZero(surface.scalars)
     const look = this.look.begin(scale && { name: T.figures.sdShort, label: T.figures.sdLegend, unit: 'mm', scale }, false)
     await this.surface.show(surface, look)
+    signal.throwIfAborted()
     this.placed = placed(surface, drawing.grid)
     for (const pane of this.canvases) pane.draw()
     this.look.element.hidden = false

@@ -1,10 +1,10 @@
 /** Two results beside each other, each coloured by how far it lies outside (or inside) the other. */
 
-import { type Api, resultPath, sentence } from '../api'
+import { type Api, isAbort, resultPath, sentence } from '../api'
 import { legend, scaleAroundZero } from '../colour'
 import { button, field, h, option, replace, unique } from '../dom'
 import { type Surface, readMz3 } from '../mesh'
-import { keep, knownResults } from '../results'
+import { type Known, keep, knownResults } from '../results'
 import { decoded } from '../route'
 import { Status } from '../status'
 import { T } from '../text'
@@ -19,6 +19,8 @@ export class Compare {
   private readonly legendPlace = h('div', { class: 'legend-place still' })
   private readonly status = new Status()
   private linked = false
+  private readonly offered = new Set<string>()
+  private working = new AbortController()
 
   constructor(private readonly api: Api) {
     this.status.element.classList.add('finding')
@@ -34,38 +36,53 @@ export class Compare {
     for (const one of [this.first, this.second]) {
       replace(one.list, ...known.map((result) => option(result.id, result.label)))
     }
-    const [latest, before] = known
-    if (latest && !this.first.element.value) this.first.element.value = latest.id
-    if (before && !this.second.element.value) this.second.element.value = before.id
+    this.offer(this.first.element, this.second.element, known)
+    this.offer(this.second.element, this.first.element, known)
+  }
+
+  /** The latest result that the other place does not hold; what was offered before and is gone is taken back. */
+  private offer(place: HTMLInputElement, other: HTMLInputElement, known: Known[]): void {
+    if (this.offered.has(place.value) && !known.some(({ id }) => id === place.value)) place.value = ''
+    if (place.value) return
+    place.value = known.find(({ id }) => id !== identifier(other.value))?.id ?? ''
+    this.offered.add(place.value)
   }
 
   private async run(): Promise<void> {
     const [a, b] = [identifier(this.first.element.value), identifier(this.second.element.value)]
-    if (!a || !b) {
-      this.fail(T.compare.needTwo)
-      return
-    }
+    this.working.abort()
+    this.working = new AbortController()
+    if (!a || !b) this.fail(T.compare.needTwo)
+    else if (a === b) this.fail(T.compare.needOther)
+    else await this.measure(a, b, this.working.signal)
+  }
+
+  private async measure(a: string, b: string, signal: AbortSignal): Promise<void> {
     for (const id of [a, b]) keep(id)
     try {
       this.status.say(T.compare.working)
-      const surfaces = await Promise.all([this.fetch(a, b), this.fetch(b, a)])
-      await this.show(surfaces)
+      const surfaces = await Promise.all([this.fetch(a, b, signal), this.fetch(b, a, signal)])
+      signal.throwIfAborted()
+      await this.show(surfaces, signal)
     } catch (fault) {
-      this.fail(sentence(fault))
+      if (!isAbort(fault)) this.fail(sentence(fault))
     }
   }
 
-  /** Told below the button, and brought into sight. */
+  /** Told below the button, and brought into sight; surfaces of another comparison are shown no longer. */
   private fail(text: string): void {
+    this.pair.hidden = true
+    replace(this.legendPlace)
     this.status.fail(text)
     this.status.element.scrollIntoView({ block: 'nearest' })
   }
 
-  private async show(surfaces: [Surface, Surface]): Promise<void> {
+  private async show(surfaces: [Surface, Surface], signal: AbortSignal): Promise<void> {
     const both = new Float32Array(surfaces.flatMap((surface) => [...surface.scalars!]))
     const scale = scaleAroundZero(both)
     this.pair.hidden = false
     for (const n of [0, 1] as const) await this.views[n].show(surfaces[n], { ...PLAIN_LOOK, scale })
+    signal.throwIfAborted()
     if (!this.linked) this.views[0].link(this.views[1])
     this.linked = true
     replace(this.legendPlace, legend(scale, T.compare.legend, 'mm'))
@@ -73,8 +90,8 @@ export class Compare {
     this.status.say(T.compare.finding(mean, both.reduce((a, b) => Math.max(a, Math.abs(b)), 0)))
   }
 
-  private async fetch(id: string, other: string): Promise<Surface> {
-    return readMz3(await this.api.bytes(resultPath(id, `/comparison?other=${encodeURIComponent(other)}&format=mz3&space=RAS`)))
+  private async fetch(id: string, other: string, signal: AbortSignal): Promise<Surface> {
+    return readMz3(await this.api.bytes(resultPath(id, `/comparison?other=${encodeURIComponent(other)}&format=mz3&space=RAS`), signal))
   }
 }
 

@@ -1,9 +1,10 @@
 /** Synthetic shapes by their seeds: the same address shows the same shapes. */
 
-import { type Api, isAbort } from '../api'
+import { type Api, isAbort, sentence } from '../api'
 import { button, field, h, replace } from '../dom'
 import { frame, readMz3 } from '../mesh'
 import { moveTo, slider, sliderField } from '../slider'
+import { Status } from '../status'
 import { T } from '../text'
 import type { ModelDescription } from '../types'
 import { PLAIN_LOOK, SurfaceView } from '../viewer'
@@ -19,16 +20,16 @@ export class Gallery {
   private readonly temperature: HTMLInputElement
   private readonly grid = h('ul', { class: 'shapes' })
   private readonly painter = new SurfaceView(T.gallery.painter, { cube: false, size: 1.3 })
-  private readonly told = h('p', { class: 'hint', role: 'status' })
+  private readonly status = new Status()
   private model: ModelDescription | null = null
   private working = new AbortController()
 
   constructor(
     private readonly api: Api,
     query: URLSearchParams,
-    private readonly fail: (fault: unknown) => void,
     private readonly changed: () => void,
   ) {
+    this.status.element.classList.add('hint')
     this.seed.value = query.get('seed') ?? '0'
     this.temperature = slider(0.2, 2, Number(query.get('temperature') ?? 1), () => undefined, 0.1)
     for (const control of [this.seed, this.temperature]) control.addEventListener('change', () => this.redraw())
@@ -36,7 +37,7 @@ export class Gallery {
     this.painter.element.setAttribute('aria-hidden', 'true')
     this.painter.element.inert = true
     const controls = h('div', { class: 'row' }, field(T.gallery.seed, this.seed), sliderField(T.gallery.temperature, this.temperature, T.plainNumber), button(T.gallery.more, () => this.more()))
-    replace(this.element, h('h2', {}, T.gallery.title), h('p', { class: 'hint' }, T.gallery.how), controls, this.grid, this.told, this.painter.element)
+    replace(this.element, h('h2', {}, T.gallery.title), h('p', { class: 'hint' }, T.gallery.how), controls, this.grid, this.status.element, this.painter.element)
   }
 
   query(): Record<string, string> {
@@ -76,24 +77,30 @@ export class Gallery {
     const items = Array.from({ length: COUNT }, (_, n) => this.item(first + n))
     replace(this.grid, ...items.map(([item]) => item))
     const waiting = items.map(([, canvas], n) => [first + n, canvas] as const)
-    this.told.textContent = T.gallery.drawing
+    this.status.say(T.gallery.drawing)
     const lane = async (): Promise<void> => {
       for (let next = waiting.shift(); next; next = waiting.shift()) await this.paint(next[0], next[1], signal)
     }
     try {
       await Promise.all(Array.from({ length: LANES }, lane))
-      this.told.textContent = T.gallery.done(COUNT)
+      signal.throwIfAborted()
+      this.status.say(T.gallery.done(COUNT))
     } catch (fault) {
-      if (isAbort(fault)) return
-      this.told.textContent = ''
       this.fail(fault)
     }
+  }
+
+  private fail(fault: unknown): void {
+    if (!isAbort(fault)) this.status.fail(sentence(fault))
   }
 
   private item(seed: number): [HTMLElement, HTMLCanvasElement] {
     const canvas = h('canvas', { width: 240, height: 200, role: 'img', 'aria-label': T.gallery.shape(seed) })
     const save = (): void => {
-      this.api.download(`${this.path(seed)}&format=stl`, `shape_${seed}.stl`).catch(this.fail)
+      this.api.download(`${this.path(seed)}&format=stl`, `shape_${seed}.stl`).then(
+        () => this.status.recover(),
+        (fault: unknown) => this.fail(fault),
+      )
     }
     const caption = h('div', { class: 'row' }, h('span', {}, T.gallery.seedOf(seed)), button(T.gallery.save, save, { class: 'quiet', 'aria-label': T.gallery.saveSeed(seed) }))
     return [h('li', {}, canvas, caption), canvas]

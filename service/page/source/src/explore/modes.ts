@@ -1,10 +1,11 @@
 /** The mean shape, moved along the model's leading modes by sliders while they are dragged. */
 
-import { type Api, isAbort } from '../api'
+import { type Api, isAbort, sentence } from '../api'
 import { type Scale, legend, scaleAroundZero } from '../colour'
 import { button, h, mark, replace } from '../dom'
 import { frame, readMz3 } from '../mesh'
 import { moveTo, slider, valueOf } from '../slider'
+import { Status } from '../status'
 import { T } from '../text'
 import type { Mode, ModelDescription } from '../types'
 import { PLAIN_LOOK, SurfaceView } from '../viewer'
@@ -17,10 +18,10 @@ const REST_MS = 250
 
 export class Modes {
   readonly element = h('section', { class: 'card modes' })
-  private readonly view = new SurfaceView(T.modes.surface, { size: 1.4 })
+  private readonly view = new SurfaceView(T.modes.surface, { size: 1.25 })
   private readonly sliders = h('div', { class: 'sliders' })
   private readonly legendPlace = h('div', { class: 'legend-place' })
-  private readonly told = h('p', { class: 'hint', role: 'status' })
+  private readonly status = new Status()
   private coordinates = new Map<number, number>()
   private model: ModelDescription | null = null
   private working = new AbortController()
@@ -29,12 +30,10 @@ export class Modes {
   private rest = 0
   private scale: Scale = scaleAroundZero(new Float32Array([1]))
 
-  constructor(
-    private readonly api: Api,
-    private readonly fail: (fault: unknown) => void,
-  ) {
+  constructor(private readonly api: Api) {
+    this.status.element.classList.add('hint')
     const reset = button(T.modes.reset, () => void this.begin(), { class: 'quiet' })
-    const side = h('div', {}, h('h2', {}, T.modes.title), h('p', { class: 'hint' }, T.modes.how), this.sliders, reset, this.told)
+    const side = h('div', {}, h('h2', {}, T.modes.title), h('p', { class: 'hint' }, T.modes.how), this.sliders, reset, this.status.element)
     replace(this.element, side, h('div', { class: 'stage' }, this.view.element, this.legendPlace))
   }
 
@@ -50,7 +49,7 @@ export class Modes {
   private async begin(): Promise<void> {
     this.coordinates.clear()
     for (const input of this.sliders.querySelectorAll('input')) moveTo(input, '0')
-    this.told.textContent = ''
+    this.status.say('')
     await this.fetch(1)
   }
 
@@ -99,9 +98,10 @@ export class Modes {
       if (surface.scalars) this.widen(surface.scalars)
       replace(this.legendPlace, surface.scalars && legend(this.scale, T.modes.legend, 'mm'))
       await this.view.show(surface, { ...PLAIN_LOOK, scale: surface.scalars && this.scale }, null, frame(model.half_extent_mm))
-      if (coarser === 1) this.told.textContent = this.coordinates.size > 0 ? T.modes.fine : ''
+      if (coarser === 1) this.status.say(this.coordinates.size > 0 ? T.modes.fine : '')
+      else this.status.recover()
     } catch (fault) {
-      if (!isAbort(fault)) this.fail(fault)
+      if (!isAbort(fault)) this.status.fail(sentence(fault))
     }
   }
 }

@@ -27,8 +27,8 @@ export class ExploreView {
     private readonly api: Api,
     query: URLSearchParams,
   ) {
-    this.modes = new Modes(api, this.fail)
-    this.gallery = new Gallery(api, query, this.fail, () => this.remember())
+    this.modes = new Modes(api)
+    this.gallery = new Gallery(api, query, () => this.remember())
     this.compare = new Compare(api)
     this.wanted = query.get('model')
     this.model.addEventListener('change', () => void this.choose())

@@ -3,9 +3,9 @@
 import { figure } from '../colour'
 import { h } from '../dom'
 import { planeName } from '../grid'
-import { type Sent, warningsInWords } from '../places'
+import { type Sent, fileOf, warningsInWords } from '../places'
 import { T } from '../text'
-import type { Estimate, Grid, Summary } from '../types'
+import type { Estimate, Plane, Summary } from '../types'
 
 export function figures(summary: Summary): HTMLElement {
   const sd = summary.surface_sd
@@ -39,14 +39,18 @@ export function warnings(summary: Summary, sent: Sent): HTMLElement {
 }
 
 /** How far each drawn slice and the result disagree. */
-export function residuals(summary: Summary, grids: Grid[] | null): HTMLElement {
-  const name = (stack: number, axis: number): string =>
-    grids?.[stack] ? T.plane[planeName(grids[stack], axis)] : T.figures.axis(axis)
+export function residuals(summary: Summary, sent: Sent): HTMLElement {
+  const several = new Set(summary.residuals.map(({ plane }) => plane.stack)).size > 1
+  const name = ({ stack, axis, index }: Plane): string => {
+    const grid = sent.stacks?.[stack]
+    const place = T.figures.slice(grid ? T.plane[planeName(grid, axis)] : T.figures.axis(axis), index + 1)
+    return several ? T.place.ofFile(place, fileOf(sent, stack)) : place
+  }
   const rows = summary.residuals.map(({ plane, disagreement }) =>
     h(
       'tr',
       {},
-      h('th', { scope: 'row' }, T.figures.slice(name(plane.stack, plane.axis), plane.index + 1)),
+      h('th', { scope: 'row' }, name(plane)),
       h('td', {}, h('meter', { min: 0, max: 1, value: 1 - disagreement, 'aria-hidden': 'true' })),
       h('td', { class: 'number' }, figure(1 - disagreement)),
     ),

@@ -5,9 +5,10 @@ import { drawnVoxels } from '../drawn'
 import { h, option, replace } from '../dom'
 import { layoutOf, planeName } from '../grid'
 import type { Pane } from '../pane'
+import { fileOf } from '../places'
 import { Sections, middleOf } from '../sections'
 import { T } from '../text'
-import type { DrawnPlanes } from '../types'
+import type { DrawnPlanes, Plane } from '../types'
 
 const TICK = 'rgb(241 163 64 / 75%)'
 
@@ -15,9 +16,9 @@ export class Preview {
   readonly element = h('div', { class: 'preview' })
   private readonly sections = new Sections()
 
-  show(drawn: DrawnPlanes): void {
+  show(drawn: DrawnPlanes, files: string[]): void {
     const choice = h('select', { 'aria-label': T.preview.stack })
-    drawn.stacks.forEach((stack, n) => choice.append(option(String(n), T.preview.part(stack.part))))
+    drawn.stacks.forEach((_, n) => choice.append(option(String(n), fileOf({ stacks: drawn.stacks, files }, n))))
     choice.addEventListener('change', () => this.showStack(drawn, Number(choice.value)))
     const head = h('header', { class: 'row' }, h('h2', {}, T.preview.title), drawn.stacks.length > 1 && choice)
     replace(this.element, head, h('p', {}, summary(drawn)), this.sections.element, h('p', { class: 'hint' }, T.preview.hint))
@@ -27,8 +28,8 @@ export class Preview {
   private showStack(drawn: DrawnPlanes, stack: number): void {
     const grid = drawn.stacks[stack]!
     const voxels = drawnVoxels(drawn, stack)
-    const start = middleOf(grid, voxels)
-    for (const plane of drawn.planes) if (plane.stack === stack) start[plane.axis] = plane.index
+    const planes = drawn.planes.filter((plane) => plane.stack === stack)
+    const start = middleOf(grid, voxels).map((middle, axis) => nearest(planes.filter((plane) => plane.axis === axis), middle))
     const paint = (voxel: number) => (voxels.has(voxel) ? ([...DRAWN, 255] as [number, number, number, number]) : null)
     this.sections.show(grid, paint, (context, pane) => markPlanes(context, pane, drawn, stack), start)
   }
@@ -57,6 +58,13 @@ export function markPlanes(context: CanvasRenderingContext2D, pane: Pane, drawn:
     context.stroke()
   }
   context.setLineDash([])
+}
+
+/** Index of the plane that lies nearest to a place; the place itself where there is none. */
+function nearest(planes: Plane[], place: number): number {
+  const away = (index: number): number => Math.abs(index - place)
+  const found = [...planes].sort((a, b) => away(a.index) - away(b.index))[0]
+  return found ? found.index : place
 }
 
 function summary(drawn: DrawnPlanes): string {

@@ -39,12 +39,14 @@ export class ResultPanel {
     }
     const planes = drawn ? planeSurface(drawn) : null
     await this.view.show(surface, this.look.begin(colouring, planes !== null), planes)
+    signal.throwIfAborted()
+    const sent = { stacks: drawn?.stacks ?? null, files }
     replace(
       this.element,
       figures(summary),
-      warnings(summary, { stacks: drawn?.stacks ?? null, files }),
+      warnings(summary, sent),
       this.slices.element,
-      residuals(summary, drawn?.stacks ?? null),
+      residuals(summary, sent),
       this.keeping(summary),
     )
     const uncertain = summary.uncertainty !== 'none'
@@ -80,11 +82,12 @@ export class ResultPanel {
 
   private link(summary: Summary): HTMLElement {
     const address = h('input', { type: 'text', readonly: true, value: resultLink(summary.id) })
-    const told = h('p', { role: 'status', class: 'hint' }, T.link.until(new Date(summary.expires)))
+    const until = h('p', { class: 'hint' }, T.link.until(new Date(summary.expires)))
+    const told = h('p', { role: 'status', class: 'hint' })
     const copy = async (): Promise<void> => {
       told.textContent = (await copied(address)) ? T.link.copied : T.link.selected
     }
-    return h('div', { class: 'downloads' }, field(T.link.title, address), button(T.link.copy, () => void copy()), told)
+    return h('div', { class: 'downloads' }, field(T.link.title, address), button(T.link.copy, () => void copy()), until, told)
   }
 
   private origin(summary: Summary): HTMLElement {

@@ -66,7 +66,8 @@ function edges(labels: Volume, drawn: DrawnPlanes | null): Over {
     outline(context, pane, (voxel) => labels.values[voxel]! > 0, EDGE)
     const plane = drawn?.planes.find((p) => p.stack === 0 && p.axis === pane.layout.axis && p.index === pane.slice)
     if (!plane) return
-    const voxels = new Set(voxelsOf(labels, plane).map((index) => voxelNumber(labels, index)))
+    const voxels = new Set<number>()
+    for (const index of voxelsOf(labels, plane)) voxels.add(voxelNumber(labels, index))
     outline(context, pane, (voxel) => voxels.has(voxel), SEEN)
   }
 }

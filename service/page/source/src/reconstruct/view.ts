@@ -28,6 +28,10 @@ export class ReconstructView {
   private working = new AbortController()
   private shown: string | null = null
   private sending = false
+  private lookingUp = false
+  /** Whether other masks were chosen while something was sent, and their planes once they are read. */
+  private stale = false
+  private unseen: DrawnPlanes | null = null
   private planesRead: Promise<DrawnPlanes | null> = Promise.resolve(null)
 
   constructor(private readonly api: Api) {
@@ -56,14 +60,26 @@ export class ReconstructView {
   /** A result that was made before, by its link. */
   async open(id: string): Promise<void> {
     keep(id)
-    if (this.shown === id) return
+    if (this.shown === id) {
+      if (this.lookingUp) this.leaveLookingUp(T.result.ready)
+      return
+    }
     const [next, signal] = this.begin([T.steps.summary, T.steps.surface])
     this.endSending()
+    this.lookingUp = true
     await this.guarded(async () => {
-      const summary = await this.api.summary(id, signal)
+      const summary = await this.api.summary(id, signal).catch(toldAsGone)
       next(1)
       await this.showResult(summary, null, [], signal)
     })
+    if (signal === this.working.signal) this.lookingUp = false
+  }
+
+  /** Something else is asked for than the result that is being looked up. */
+  private leaveLookingUp(text: string): void {
+    this.working.abort()
+    this.lookingUp = false
+    this.status.say(text)
   }
 
   private async takeExample(): Promise<void> {
@@ -83,14 +99,23 @@ export class ReconstructView {
     this.reading = new AbortController()
     const { signal } = this.reading
     const { files } = this.form
+    if (this.lookingUp) this.leaveLookingUp('')
     if (!this.sending) this.clear()
+    this.stale = this.sending
+    this.unseen = null
     if (files.length === 0) return null
     let drawn: DrawnPlanes | null = null
-    await this.guarded(async () => {
+    const read = async (): Promise<void> => {
       if (!this.sending) this.status.say(T.steps.reading)
       drawn = await this.api.planes(formOf(files, this.form.planeChoices()), signal)
-      if (!this.sending) await this.showPreview(drawn)
-    })
+      if (this.sending) {
+        this.unseen = drawn
+        return
+      }
+      this.status.say(T.preview.ready(drawn.planes.length))
+      await this.showPreview(drawn)
+    }
+    await this.guarded(read, () => !this.sending)
     return drawn
   }
 
@@ -98,6 +123,10 @@ export class ReconstructView {
   private clear(): void {
     this.status.say('')
     this.send.disabled = this.form.files.length === 0
+    this.clearPreview()
+  }
+
+  private clearPreview(): void {
     if (this.shown) return
     replace(this.below)
     void this.surface.show(null, PLAIN_LOOK)
@@ -105,14 +134,14 @@ export class ReconstructView {
   }
 
   private async showPreview(drawn: DrawnPlanes): Promise<void> {
-    this.shown = null
+    this.shown = this.unseen = null
+    this.stale = false
     this.refresh()
     this.openStage()
     this.result.look.element.hidden = true
     replace(this.result.look.legend)
-    this.preview.show(drawn)
+    this.preview.show(drawn, this.form.files.map((file) => file.name))
     replace(this.below, this.preview.element)
-    this.status.say(T.preview.ready(drawn.planes.length))
     await this.surface.show(null, PLAIN_LOOK, planeSurface(drawn))
   }
 
@@ -126,9 +155,11 @@ export class ReconstructView {
       next(1)
       remember({ id: summary.id, label: T.result.label(summary.model.name, new Date(summary.created)) })
       await this.showResult(summary, drawn, files, signal)
-      this.refresh()
     })
-    if (signal === this.working.signal) this.endSending()
+    if (signal !== this.working.signal) return
+    this.endSending()
+    if (this.unseen) await this.showPreview(this.unseen)
+    else if (this.stale) this.clearPreview()
   }
 
   /** Give up what is under way, and tell the steps of something new, which can be cancelled. */
@@ -139,6 +170,7 @@ export class ReconstructView {
       this.working.abort()
       this.status.say(T.cancelled)
     }
+    this.lookingUp = false
     return [this.status.wait(steps, cancel), this.working.signal]
   }
 
@@ -151,10 +183,13 @@ export class ReconstructView {
     this.openStage()
     await this.result.show(summary, drawn, files, signal)
     this.shown = summary.id
+    this.unseen = null
+    this.stale = false
     keep(summary.id)
     this.result.look.element.hidden = false
     replace(this.below, this.result.element)
     this.status.say(T.result.ready)
+    this.refresh()
   }
 
   private openStage(): void {
@@ -167,15 +202,18 @@ export class ReconstructView {
     this.stage.classList.add('offscreen')
   }
 
-  private async guarded(work: () => Promise<void>): Promise<void> {
+  /** @param tells whether what goes wrong is still worth telling. */
+  private async guarded(work: () => Promise<void>, tells: () => boolean = () => true): Promise<void> {
     try {
       await work()
     } catch (fault) {
-      if (isAbort(fault)) return
-      if (fault instanceof Refusal && fault.status === 404 && this.shown === null) this.status.fail(T.link.gone)
-      else this.status.fail(sentence(fault))
+      if (!isAbort(fault) && tells()) this.status.fail(sentence(fault))
     }
   }
+}
+
+function toldAsGone(fault: unknown): never {
+  throw fault instanceof Refusal && fault.status === 404 ? new Refusal(T.link.gone, fault.status) : fault
 }
 
 function welcome(run: () => void): HTMLElement {

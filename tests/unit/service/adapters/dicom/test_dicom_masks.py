@@ -108,6 +108,19 @@ def test_a_label_is_a_segment_number(kind):
         stacks_of_object(found, "mask[0]", LIMITS, frozenset({3}))
 
 
+@pytest.mark.parametrize("labels", [None, frozenset({1})])
+@pytest.mark.parametrize("kind", ["BINARY", "LABELMAP"])
+def test_a_segment_that_is_drawn_and_not_described_is_told(kind, labels):
+    images = mr_series()
+    values, _ = drawing(images)
+    left = np.indices(values.shape)[0] < values.shape[0] // 2
+    both = np.stack([values & left, values & ~left], axis=-1).astype(np.uint8)
+    found = reread(seg_of(images, both, kind, labels=("left", "right")))
+    found.SegmentSequence = [item for item in found.SegmentSequence if item.SegmentNumber != 2]
+    with pytest.raises(InvalidMask, match=r"draws segment 2, which it does not describe; segments that are there: 1$"):
+        stacks_of_object(found, "mask[0]", LIMITS, labels)
+
+
 def test_planes_in_several_directions_become_several_stacks():
     axial = mr_series(origin=(0.0, 0.0, 0.0))
     values, _ = drawing(axial)

@@ -16,7 +16,7 @@ from service.adapters.dicom.objects import quiet
 from service.adapters.dicom.results import RESULTS, result_objects
 from service.adapters.dicom.series import series_of
 from tests.dicom_parts import checker_errors, file_bytes, mr_series, reread
-from tests.unit.service.adapters.dicom.test_results import derive
+from tests.unit.service.adapters.dicom.test_results import MOMENT_S, derive
 
 #: Character sets of images and names that they can spell, with ideographic and phonetic groups.
 NAMES = [
@@ -66,7 +66,7 @@ def derived():
 def results_on(images, derived):
     """The results of the same drawing with the headers of other images, read back from their files."""
     derivation, probability = derived
-    found = result_objects(replace(derivation, series=series_of(images)), probability)
+    found = result_objects(replace(derivation, series=series_of(images)), probability, MOMENT_S)
     return {name: file_bytes(item) for name, item in found.items()}
 
 

@@ -26,6 +26,8 @@ from tests.dicom_parts import PATIENT_ID, checker_errors, file_bytes, grid_of, m
 from tests.service_parts import sparse_ellipsoid
 
 LIMITS = ImageLimits(max_bytes=1 << 24, max_voxels=1 << 22)
+#: When results are made: 2 March 2023, 23:30:15.25 UTC.
+MOMENT_S = 1677799815.25
 
 
 def derive(images, key: str = "the same"):
@@ -48,7 +50,7 @@ def derived():
 
 @pytest.fixture(scope="module")
 def objects(derived):
-    return {name: reread(found) for name, found in result_objects(*derived).items()}
+    return {name: reread(found) for name, found in result_objects(*derived, MOMENT_S).items()}
 
 
 @pytest.mark.parametrize("name", RESULTS)
@@ -70,8 +72,8 @@ def test_all_are_of_the_study_and_none_is_of_the_series(objects, derived):
 
 
 def test_identifiers_are_the_same_for_the_same_work_and_others_for_other_work(objects):
-    again = result_objects(*derive(mr_series()))
-    other = result_objects(*derive(mr_series(), "another"))
+    again = result_objects(*derive(mr_series()), MOMENT_S)
+    other = result_objects(*derive(mr_series(), "another"), MOMENT_S)
     for name, found in objects.items():
         assert again[name].SOPInstanceUID == found.SOPInstanceUID != other[name].SOPInstanceUID
 
@@ -145,7 +147,7 @@ def test_every_description_is_whole_and_fits(cut, derived):
         short = series_of(list(derivation.series.images[:8]))
         derivation, probability = replace(derivation, series=short), probability[:, :, :8]
     assert derivation.is_cut is cut
-    for name, found in result_objects(derivation, probability).items():
+    for name, found in result_objects(derivation, probability, MOMENT_S).items():
         told = list(descriptions_of(reread(found)))
         assert told, name
         for text in told:
@@ -190,7 +192,7 @@ def test_multi_frame_images_are_a_series_as_well(tmp_path):
     enhanced = hd.legacy.LegacyConvertedEnhancedMRImage(images, generate_uid(), 5, generate_uid(), 1)
     derivation, probability = derive([reread(enhanced)])
     assert derivation.series.grid.coincides_with(grid_of(images))
-    results = result_objects(derivation, probability)
+    results = result_objects(derivation, probability, MOMENT_S)
     if shutil.which("dciodvfy") is not None:
         assert [error for found in results.values() for error in checker_errors(file_bytes(found), tmp_path)] == []
     (stack,) = stacks_of_object(reread(results["segmentation"]), "mask[0]", LIMITS, home=derivation.series.grid)
@@ -203,7 +205,7 @@ def test_one_structure_of_several_is_told_by_its_number_and_name(derived):
     drawn, _ = sparse_ellipsoid(shape=derivation.series.grid.shape)
     both = reread(seg_of(images, np.stack([drawn, drawn], -1), labels=("left", "right")))
     right = replace(derivation, drawing=both, labels=frozenset({2}))
-    results = {name: reread(found) for name, found in result_objects(right, probability).items()}
+    results = {name: reread(found) for name, found in result_objects(right, probability, MOMENT_S).items()}
     assert all("#2 (" in text for found in results.values() for text in descriptions_of(found))
     assert results["segmentation"].SegmentSequence[0].SegmentLabel == "right"
     assert results["surface"].SegmentSequence[0].SegmentLabel == "right"
@@ -233,30 +235,40 @@ def test_descriptions_with_a_number_fit_where_the_object_is_cut(number, derived)
     assert len(cut.description("Uncertainty maps")) <= 64
 
 
-@pytest.mark.parametrize("offset", ["+0530", "-0800", ""])
-def test_all_results_are_of_one_moment_in_the_time_zone_of_the_images(offset, derived):
+@pytest.mark.parametrize(
+    ("offset", "date", "time"),
+    [("+0530", "20230303", "050015.25"), ("-0800", "20230302", "153015.25"), ("+0000", "20230302", "233015.25")],
+)
+def test_all_results_are_of_one_moment_in_the_time_zone_of_the_images(offset, date, time, derived):
+    found = dated_results(derived, offset)
+    assert {(item.InstanceCreationDate, item.ContentDate) for item in found} == {(date, date)}
+    assert {(float(item.InstanceCreationTime), float(item.ContentTime)) for item in found} == {(float(time),) * 2}
+    assert {item.TimezoneOffsetFromUTC for item in found} == {offset}
+
+
+@pytest.mark.parametrize("offset", ["", "nonsense"])
+def test_without_a_time_zone_of_the_images_results_say_none(offset, derived):
+    local = datetime.fromtimestamp(MOMENT_S).strftime("%Y%m%d%H%M%S.%f")
+    found = dated_results(derived, offset)
+    assert {f"{item.ContentDate}{item.ContentTime}" for item in found} == {local}
+    assert {f"{item.InstanceCreationDate}{item.InstanceCreationTime}" for item in found} == {local}
+    assert not any("TimezoneOffsetFromUTC" in item for item in found)
+
+
+def dated_results(derived, offset):
+    """The results on images with an offset from UTC, read back."""
     images = [reread(found) for found in mr_series()]
     for image in images:
         if offset:
             image.TimezoneOffsetFromUTC = offset
-    zone = datetime.strptime(offset, "%z").tzinfo if offset else None
-    before = datetime.now(zone)
-    results = result_objects(replace(derived[0], series=series_of(images)), derived[1]).values()
-    after = datetime.now(zone)
-    moments = {
-        (found.InstanceCreationDate, found.InstanceCreationTime, found.ContentDate, found.ContentTime)
-        for found in map(reread, results)
-    }
-    ((created_on, created_at, made_on, made_at),) = moments
-    assert (created_on, created_at) == (made_on, made_at)
-    assert before <= datetime.strptime(f"{made_on}{made_at}", "%Y%m%d%H%M%S.%f").replace(tzinfo=zone) <= after
-    assert {found.get("TimezoneOffsetFromUTC", "") for found in results} == {offset}
+    derivation = replace(derived[0], series=series_of(images))
+    return [reread(found) for found in result_objects(derivation, derived[1], MOMENT_S).values()]
 
 
 def test_a_drawing_of_another_study_is_referred_to_as_such(derived, tmp_path):
     elsewhere = reread(derived[0].drawing)
     elsewhere.StudyInstanceUID = generate_uid()
-    results = result_objects(replace(derived[0], drawing=elsewhere), derived[1])
+    results = result_objects(replace(derived[0], drawing=elsewhere), derived[1], MOMENT_S)
     for name in ("stl", "surface"):
         (study,) = results[name].StudiesContainingOtherReferencedInstancesSequence
         assert study.StudyInstanceUID == elsewhere.StudyInstanceUID

@@ -5,7 +5,7 @@ from multiprocessing import get_context
 
 import pytest
 
-from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome, broken_line
+from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome, TrailCheck, check_trail
 
 
 def entry(number: int) -> AuditEntry:
@@ -32,32 +32,48 @@ def test_lines_say_who_what_and_whither(tmp_path):
 def test_a_whole_trail_is_whole_and_a_changed_one_is_not(tmp_path):
     path = tmp_path / "audit.jsonl"
     write(path, 6)
-    assert broken_line(path) is None
+    assert check_trail(path) == TrailCheck(None)
     lines = path.read_bytes().splitlines(keepends=True)
     for broken, expected in (
         ([*lines[:2], lines[2].replace(b"VIEWER", b"NOBODY"), *lines[3:]], 3),
         ([*lines[:3], *lines[4:]], 4),
         ([*lines[:1], lines[2], lines[1], *lines[3:]], 2),
         ([lines[0], b"no json\n"], 2),
+        ([lines[0], b"[1]\n", *lines[1:]], 2),
+        ([lines[0], lines[1][:-20] + b"\n", *lines[2:]], 3),
     ):
         path.write_bytes(b"".join(broken))
-        assert broken_line(path) == expected
+        assert check_trail(path).broken == expected
 
 
 @pytest.mark.parametrize("kept", [0, 2])
-def test_what_was_torn_spoils_no_later_line(tmp_path, kept):
+@pytest.mark.parametrize("length", [1, 5, 12, 200])
+def test_what_was_torn_breaks_no_later_line(tmp_path, kept, length):
     path = tmp_path / "audit.jsonl"
     write(path, kept)
     whole = path.read_bytes() if kept else b""
     write(path, 1)
-    torn = path.read_bytes()[len(whole) : -20]
+    torn = path.read_bytes()[len(whole) :][:length]
     path.write_bytes(whole + torn)
+    assert check_trail(path) == TrailCheck(None, (kept + 1,))
     write(path, 2)
     lines = path.read_bytes().splitlines(keepends=True)
     assert lines[kept] == torn + b"\n"
-    assert broken_line(path) == kept + 1
-    path.write_bytes(b"".join([*lines[:kept], *lines[kept + 1 :]]))
-    assert broken_line(path) is None
+    assert check_trail(path) == TrailCheck(None, (kept + 1,))
+    path.write_bytes(b"".join([*lines[:-1], lines[-1].replace(b"VIEWER", b"NOBODY")]))
+    assert check_trail(path) == TrailCheck(kept + 3, (kept + 1,))
+    path.write_bytes(b"".join([*lines[: kept + 1], lines[-1]]))
+    assert check_trail(path) == TrailCheck(kept + 2, (kept + 1,))
+
+
+def test_a_line_without_its_end_is_whole(tmp_path):
+    path = tmp_path / "audit.jsonl"
+    write(path, 2)
+    path.write_bytes(path.read_bytes()[:-1])
+    assert check_trail(path) == TrailCheck(None)
+    write(path, 1)
+    assert check_trail(path) == TrailCheck(None)
+    assert len(path.read_bytes().splitlines()) == 3
 
 
 def test_processes_write_in_turn(tmp_path):
@@ -68,7 +84,7 @@ def test_processes_write_in_turn(tmp_path):
         writer.start()
     for writer in writers:
         writer.join()
-    assert broken_line(path) is None
+    assert check_trail(path) == TrailCheck(None)
     assert len(path.read_text().splitlines()) == 60
 
 

@@ -74,14 +74,6 @@ def test_an_earlier_request_may_still_succeed_but_not_fail(blobs):
     assert requests.report() == Report()
 
 
-@pytest.mark.parametrize(("content", "report"), [(b"committed", Report()), (b"failed", Report(None))])
-def test_reports_of_an_earlier_release_are_read(blobs, content, report):
-    requests, transaction = asked(blobs)
-    (marker,) = blobs.list(f"{COMMITMENTS}/")
-    blobs.put(marker.replace("asked", "report"), content)
-    assert Reports(blobs).find(transaction) == requests.report() == report
-
-
 def test_of_a_silent_archive_only_the_last_requests_are_remembered(blobs):
     transactions = [asked(blobs)[1] for _ in range(REMEMBERED + 3)]
     requests = Requests(blobs, KEY)
