@@ -87,6 +87,8 @@ class Fit:
         rival: another optimum, of those that starts led to, that the drawing hardly tells from this one; None without.
         discrepancy: what the drawn contours show and the code cannot express; None when it was not asked for.
         trust: share of the model's likelihood precision that the drawing was given; below 1 for a rough one.
+        full_trust_misfit_mm: how far the contours of a rough drawing lay from the fit that trusted it in full (RMS);
+            None of any other.
     """
 
     latent: Float[np.ndarray, "d"]
@@ -101,3 +103,4 @@ class Fit:
     rival: Rival | None = None
     discrepancy: Discrepancy | None = None
     trust: float = 1.0
+    full_trust_misfit_mm: float | None = None

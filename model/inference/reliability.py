@@ -111,7 +111,8 @@ def less_trusting(
             return model, judged
     lower = ROUGH_SHARE * model.manifest.likelihood_precision
     doubting = replace(model, manifest=replace(model.manifest, likelihood_precision=lower))
-    return doubting, replace(refit(doubting, observations, tried, options), trust=ROUGH_SHARE)
+    doubted = refit(doubting, observations, tried, options)
+    return doubting, replace(doubted, trust=ROUGH_SHARE, full_trust_misfit_mm=_misfit(model, judged))
 
 
 def _ever_harder(model: ShapeModel, observations: Observations, found: Fit, options: FitOptions) -> Iterator[Fit]:

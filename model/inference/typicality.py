@@ -24,7 +24,7 @@ from model.inference.mask_stack import Plane
 from model.inference.reliability import MOST_USUAL_PLANES, Figures, usual_share
 
 #: Below this percentile a shape is called unlike the population; below the other when it is by the density alone.
-ATYPICAL_PERCENTILE, ATYPICAL_BY_DENSITY = 0.1, 1.0
+ATYPICAL_PERCENTILE, ATYPICAL_BY_DENSITY = 0.5, 1.0
 #: A slice is told of when sound drawings would disagree as much with so small a probability.
 SURPRISING = 1e-3
 
@@ -50,13 +50,14 @@ def typicality(model: ShapeModel, found: Fit, figures: Figures) -> tuple[float, 
     known = model.manifest.typical
     if not known:
         return density, float(100.0 * np.mean(model.population.log_densities < density))
+    misfit_mm = _trusting_misfit(found, figures)
     tails = []
-    if figures.planes <= MOST_USUAL_PLANES or not figures.misfit_mm > 0.0:
+    if figures.planes <= MOST_USUAL_PLANES or not misfit_mm > 0.0:
         rare = float(rarity(np.array([density]), known["density_peak"])[0])
         tails.append(_tail(known, (rare - known["rarity_mean"]) / known["rarity_sd"]))
-    if figures.misfit_mm > 0.0:
+    if misfit_mm > 0.0:
         usual = known["misfit_mean"] + known["misfit_exponent"] * np.log(usual_share(figures.planes))
-        tails.append(_tail(known, (np.log(figures.misfit_mm) - usual) / known["misfit_sd"]))
+        tails.append(_tail(known, (np.log(misfit_mm) - usual) / known["misfit_sd"]))
     return density, 100.0 * (1.0 - (1.0 - min(tails)) ** len(tails))
 
 
@@ -104,6 +105,12 @@ def predictive_warnings(
         "drawings: it contradicts the others, or the shape is unlike the population."
     )
     return (sentence,)
+
+
+def _trusting_misfit(found: Fit, figures: Figures) -> float:
+    """Misfit (mm) of the fit that trusts the drawing, as those were that it is held against; 0 when not looked at."""
+    rough = found.full_trust_misfit_mm
+    return figures.misfit_mm if rough is None or not figures.misfit_mm > 0.0 else rough
 
 
 def _tail(known: Mapping[str, float], z: float) -> float:

@@ -72,6 +72,19 @@ def test_a_rough_drawing_is_trusted_less():
     assert 0.3 < ratio / (len(wary.precision) * np.log(ROUGH_SHARE)) < 1.0
 
 
+def test_a_rough_drawing_is_as_typical_as_where_it_is_trusted():
+    """What is usual was measured on fits that trust drawings; a wary fit keeps away from the contours on purpose."""
+    misfit = {"misfit_exponent": 0.1, "misfit_mean": -0.5, "misfit_sd": 0.5}
+    density = {"density_peak": 0.0, "rarity_mean": 0.0, "rarity_sd": 1e6}
+    typical = {"freedom": 15.0, "slice_mean": 0.0, "slice_sd": 1.0, **misfit, **density}
+    models = [replace(one, manifest=replace(one.manifest, typical=typical)) for one in (PLAIN, MODEL)]
+    rough = noisy(FIVE, np.random.default_rng(1), sd_mm=1.5)
+    trusting, wary = (answered(rough, model) for model in models)
+    assert wary.state.fits[0].trust < trusting.state.fits[0].trust
+    assert wary.typicality_percentile == pytest.approx(trusting.typicality_percentile, rel=0.02)
+    assert 1.0 < wary.typicality_percentile < 99.0
+
+
 def test_a_clean_drawing_is_trusted_as_much():
     trusting, wary = (answered(FIVE, model).state.fits[0] for model in (PLAIN, MODEL))
     np.testing.assert_array_equal(wary.latent, trusting.latent)
