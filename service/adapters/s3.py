@@ -40,7 +40,7 @@ class S3Blobs:
             response_checksum_validation="when_required",
         )
         try:
-            self._client = boto3.client("s3", endpoint_url=endpoint, config=config)
+            self._client = boto3.Session().client("s3", endpoint_url=endpoint, config=config)
         except (BotoCoreError, ValueError) as fault:
             raise InvalidParameter(
                 "MORPHOFLOW_STORAGE_URL needs a profile and a region that exist (AWS_PROFILE, AWS_DEFAULT_REGION), and "

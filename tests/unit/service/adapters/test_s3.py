@@ -18,11 +18,12 @@ REFUSAL = b"<Error><Code>QuotaExceeded</Code><Message>full</Message></Error>"
 
 
 class Refusing(BaseHTTPRequestHandler):
-    """Takes nothing."""
+    """Takes nothing, and notes who asked."""
 
     protocol_version = "HTTP/1.1"
 
     def do_GET(self):
+        self.server.asked.append(self.headers["Authorization"])
         self.rfile.read(int(self.headers.get("Content-Length") or 0))
         self.send_response(403)
         self.send_header("Content-Length", str(len(REFUSAL)))
@@ -40,13 +41,23 @@ class Refusing(BaseHTTPRequestHandler):
 
 
 @pytest.fixture
-def blobs(monkeypatch):
+def server(monkeypatch):
     for name, value in (("ACCESS_KEY_ID", "a"), ("SECRET_ACCESS_KEY", "b"), ("DEFAULT_REGION", "us-east-1")):
         monkeypatch.setenv(f"AWS_{name}", value)
     with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
+        server.asked = []
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield S3Blobs("s3://bucket/prefix", f"http://127.0.0.1:{server.server_port}")
+        yield server
         server.shutdown()
+
+
+def opened(server):
+    return S3Blobs("s3://bucket/prefix", f"http://127.0.0.1:{server.server_port}")
+
+
+@pytest.fixture
+def blobs(server):
+    return opened(server)
 
 
 @pytest.mark.parametrize(
@@ -81,3 +92,11 @@ def test_surroundings_that_no_client_can_be_made_in_are_told_in_a_sentence(blobs
     with pytest.raises(InvalidParameter, match=name) as caught:
         S3Blobs("s3://bucket", None)
     assert value not in str(caught.value)
+
+
+def test_each_storage_is_asked_with_the_keys_of_its_time(server, monkeypatch):
+    for key in ("first", "second"):
+        monkeypatch.setenv("AWS_ACCESS_KEY_ID", key)
+        with pytest.raises(OSError, match="refused"):
+            opened(server).get("place")
+        assert f"Credential={key}/" in server.asked[-1]
