@@ -38,8 +38,12 @@ def test_workers_are_told_of_one_thread_and_their_caller_keeps_its_own(masks, tm
     before = dict(os.environ)
     sweep = Sweep(CohortSource(masks=masks), CohortOptions(), (), tmp_path, Effort(), DeviceName.CPU)
     (worker,) = start_workers(sweep, 1)
-    told = Path(f"/proc/{worker.pid}/environ").read_bytes().split(b"\0")
-    assert {b"OMP_NUM_THREADS=1", b"MKL_NUM_THREADS=1"} <= set(told)
+    end = time.monotonic() + 30.0
+    while not (told := Path(f"/proc/{worker.pid}/environ").read_bytes()):  # empty until its program is started
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    told = set(told.split(b"\0"))
+    assert {b"OMP_NUM_THREADS=1", b"MKL_NUM_THREADS=1"} <= told
     assert dict(os.environ) == before
     worker.join()
     assert worker.exitcode == 0

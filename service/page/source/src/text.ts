@@ -127,7 +127,7 @@ export const T = {
     typicality: 'Typicality',
     percentile: (value: number) => `${value.toFixed(0)} / 100`,
     typical: (value: number) =>
-      value < 0.1
+      value < 0.5
         ? 'unlike anything the model has seen'
         : value < 1
           ? 'rarer than 99 in 100 known shapes'
