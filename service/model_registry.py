@@ -28,11 +28,6 @@ class BrokenModel:
     name: str
     reason: str
 
-    def __post_init__(self) -> None:
-        """Make both text that can be sent: names of folders may hold bytes that are no letters."""
-        for part in ("name", "reason"):
-            object.__setattr__(self, part, getattr(self, part).encode("utf-8", "replace").decode())
-
 
 class ModelRegistry:
     """The `Catalogue` of models in memory.
@@ -105,11 +100,11 @@ def load_models(folders: Iterable[Path], open_model: Callable[[Path], ShapeModel
         try:
             model = open_model(folder)
         except (BundleError, OSError) as fault:
-            broken.append(BrokenModel(folder.name, _reason(fault)))
+            broken.append(_broken(folder, _reason(fault)))
             continue
         name = pinned_name(model)
         if name in models:
-            broken.append(BrokenModel(folder.name, f"Another bundle is called {name} as well."))
+            broken.append(_broken(folder, f"Another bundle is called {name} as well."))
         else:
             models[name] = model
     return ModelRegistry(models, broken)
@@ -174,7 +169,12 @@ def absent_folders(roots: Iterable[Path]) -> Iterator[BrokenModel]:
     """What stands for the folders that are named and not there, cannot be read, or are no folders."""
     for root in roots:
         if not os.access(root, os.R_OK | os.X_OK) or not root.is_dir():
-            yield BrokenModel(root.name, "MORPHOFLOW_MODELS names this folder, and there is none to read of this name.")
+            yield _broken(root, "MORPHOFLOW_MODELS names this folder, and there is none to read of this name.")
+
+
+def _broken(folder: Path, reason: str) -> BrokenModel:
+    """With text that can be sent: names of folders may hold bytes that are no letters."""
+    return BrokenModel(*(text.encode("utf-8", "replace").decode() for text in (folder.name, reason)))
 
 
 def _newest(models: Iterable[ShapeModel]) -> dict[str, ShapeModel]:

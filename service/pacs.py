@@ -7,8 +7,9 @@ from pathlib import Path
 from threading import Lock
 
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail
+from service.adapters.pacs.commitment import Reports
 from service.adapters.pacs.configuration import PacsConfiguration, load_configuration
-from service.adapters.pacs.dimse_server import dimse_listener
+from service.adapters.pacs.dimse_server import PeerDesk, dimse_listener
 from service.adapters.pacs.inbox import Inbox
 from service.job_ports import BlobStore, JobEngine
 from service.observability import Log
@@ -58,8 +59,9 @@ class Pacs:
         inbox.audit.write(AuditEntry(AuditEvent.STARTED, inbox.title, inbox.title))
         self._scope.callback(inbox.audit.write, AuditEntry(AuditEvent.STOPPED, inbox.title, inbox.title))
         if self._listener is not None:
-            places = (inbox, inbox.blobs, inbox.audit)
-            self._scope.enter_context(dimse_listener(self._listener, *places, self._log, self.turned_away.add))
+            title, reports = self._listener.ae_title, Reports(inbox.blobs)
+            desk = PeerDesk(title, inbox, reports, inbox.audit, self._log, self.turned_away.add)
+            self._scope.enter_context(dimse_listener(self._listener, desk))
         return self
 
     def __exit__(self, *_: object) -> None:

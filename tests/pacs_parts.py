@@ -18,13 +18,15 @@ from service.adapters.jobs.client import DbosJobs
 from service.adapters.jobs.worker import WorkerOptions, running_worker
 from service.adapters.pacs.archives import open_archive
 from service.adapters.pacs.audit import AuditTrail
-from service.adapters.pacs.configuration import Archive, MoveDestination, PacsConfiguration, Rule
+from service.adapters.pacs.commitment import Reports
+from service.adapters.pacs.configuration import Archive, Listener, MoveDestination, PacsConfiguration, Rule
 from service.adapters.pacs.delivery import Desk
+from service.adapters.pacs.dimse_server import PeerDesk, dimse_listener
 from service.adapters.pacs.inbox import QUARANTINE, REASON, Inbox
 from service.jobs.drawings import DrawingTools, drawing_kind
 from service.model_registry import ModelRegistry
 from service.observability import make_log
-from service.pacs import silence_libraries
+from service.pacs import Tally, silence_libraries
 from service.pacs_ports import PictureArchive, Retrieval
 from tests.analytic_model import ellipsoid_model
 from tests.dicom_parts import file_bytes, mr_series, seg_of
@@ -65,6 +67,14 @@ class Service:
         kind = drawing_kind(DrawingTools(desk, registry, limits, "0.1.0", self.log))
         with running_worker([kind], WorkerOptions(self.url, "a-0"), self.log):
             yield
+
+    @contextmanager
+    def listening(self, listener: Listener) -> Iterator[Tally]:
+        """The listener; counts associations that are one too many."""
+        turned_away, reports = Tally(), Reports(self.blobs)
+        desk = PeerDesk(listener.ae_title, self.inbox, reports, self.audit, self.log, turned_away.add)
+        with dimse_listener(listener, desk):
+            yield turned_away
 
     def until_empty(self) -> None:
         until(lambda: not self.inbox.backlog())

@@ -2,8 +2,7 @@
 
 import http.server
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 
 import pytest
 
@@ -12,7 +11,6 @@ from service.adapters.dicom.results import RESULTS
 from service.adapters.pacs.commitment import COMMITMENTS
 from service.adapters.pacs.configuration import Archive, Listener
 from service.adapters.pacs.dimse_client import DimseArchive
-from service.adapters.pacs.dimse_server import dimse_listener
 from service.pacs import Tally
 from tests.dicom_parts import file_bytes
 from tests.pacs_archives import TITLE, FakeArchive
@@ -22,11 +20,8 @@ from tests.waiting import until
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("sockets_of_refused_peers")]
 
 
-@contextmanager
-def listening(service: Service, port: int) -> Iterator[None]:
-    listener = Listener(port=port, calling_ae_titles=(TITLE,))
-    with dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log, Tally().add):
-        yield
+def listening(service: Service, port: int) -> AbstractContextManager[Tally]:
+    return service.listening(Listener(port=port, calling_ae_titles=(TITLE,)))
 
 
 def awaited(service: Service) -> int:

@@ -7,8 +7,7 @@ import socket
 import ssl
 import subprocess
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
@@ -27,15 +26,12 @@ from service.adapters.pacs import sop_classes
 from service.adapters.pacs.commitment import Report, Requests
 from service.adapters.pacs.configuration import Listener, MoveDestination, Tls
 from service.adapters.pacs.dimse_client import DimseArchive
-from service.adapters.pacs.dimse_server import dimse_listener
 from service.adapters.pacs.inbox import INBOX, OBJECT
 from service.adapters.pacs.moved_images import MOST_ASSOCIATIONS
 from service.adapters.pacs.tls import client_context
-from service.pacs import Tally
 from tests.dicom_parts import file_bytes, mr_series
 from tests.pacs_archives import TITLE, FakeArchive
 from tests.pacs_parts import (
-    Service,
     by_dicomweb,
     by_get,
     drawn_series,
@@ -54,14 +50,6 @@ pytestmark = [
 ]
 
 
-@contextmanager
-def listening(service: Service, listener: Listener) -> Iterator[Tally]:
-    """The listener; counts associations that are one too many."""
-    turned_away = Tally()
-    with dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log, turned_away.add):
-        yield turned_away
-
-
 def associate(port: int, caller: str, called: str = "MORPHOFLOW", **more):
     entity = AE(ae_title=caller)
     entity.add_requested_context("1.2.840.10008.1.1")
@@ -72,7 +60,7 @@ def associate(port: int, caller: str, called: str = "MORPHOFLOW", **more):
 def test_only_listed_callers_are_heard(orthanc, tmp_path):
     service = service_with(tmp_path, by_dicomweb(orthanc))
     (port,) = free_ports(1)
-    with listening(service, Listener(port=port, calling_ae_titles=("VIEWER",))):
+    with service.listening(Listener(port=port, calling_ae_titles=("VIEWER",))):
         peer = associate(port, "VIEWER")
         assert peer.is_established
         assert peer.send_c_echo().Status == 0
@@ -86,7 +74,7 @@ def test_a_port_with_silent_connections_is_open(tmp_path):
     service = service_with(tmp_path, FakeArchive([]).settings())
     (port,) = free_ports(1)
     listener = Listener(port=port, calling_ae_titles=("VIEWER",), maximum_associations=1)
-    with listening(service, listener), ExitStack() as silent:
+    with service.listening(listener), ExitStack() as silent:
         for _ in range(20):
             silent.enter_context(socket.create_connection(("127.0.0.1", port)))
         peer = associate(port, "VIEWER")
@@ -98,7 +86,7 @@ def test_a_port_under_tls_waits_for_no_handshake(tmp_path, certificates):
     service = service_with(tmp_path, FakeArchive([]).settings())
     (port,) = free_ports(1)
     listener = Listener(port=port, calling_ae_titles=("VIEWER",), tls=certificates)
-    with listening(service, listener), socket.create_connection(("127.0.0.1", port)):
+    with service.listening(listener), socket.create_connection(("127.0.0.1", port)):
         peer = associate(port, "VIEWER", tls_args=(client_context(certificates), "127.0.0.1"))
         assert peer.is_established
         peer.release()
@@ -108,7 +96,7 @@ def test_one_association_too_many_is_no_alert(tmp_path):
     service = service_with(tmp_path, FakeArchive([]).settings())
     (port,) = free_ports(1)
     listener = Listener(port=port, calling_ae_titles=("VIEWER",), maximum_associations=2)
-    with listening(service, listener) as turned_away:
+    with service.listening(listener) as turned_away:
         peers = [associate(port, "VIEWER") for _ in range(3)]
         assert [peer.is_established for peer in peers] == [True, True, False]
         assert peers[2].is_rejected
@@ -125,7 +113,7 @@ def test_storescu_is_acknowledged_when_the_object_is_on_disk(orthanc, tmp_path):
     (port,) = free_ports(1)
     path = tmp_path / "drawing.dcm"
     path.write_bytes(file_bytes(drawing))
-    with listening(service, Listener(port=port, calling_ae_titles=("VIEWER",))):
+    with service.listening(Listener(port=port, calling_ae_titles=("VIEWER",))):
         send([path], port, "MORPHOFLOW", "VIEWER")
     (key,) = [key for key in service.blobs.list(f"{INBOX}/") if key.endswith(OBJECT)]
     kept = dcmread(io.BytesIO(service.blobs.get(key)))
@@ -139,7 +127,7 @@ def test_storage_commitment_is_asked_for_and_reported(orthanc, ports, tmp_path):
     archive = DimseArchive(replace_archive(by_get(orthanc), commitment=True))
     unknown = mr_series()[:1]
     reports = {}
-    with listening(service, Listener(port=ports.own, calling_ae_titles=("ORTHANC",))):
+    with service.listening(Listener(port=ports.own, calling_ae_titles=("ORTHANC",))):
         for name, objects in {"held": images[:3], "unknown": unknown, "mixed": images[:2] + unknown}.items():
             requests = Requests(service.blobs, name)
             archive.ask_commitment(objects, requests.begin())
@@ -154,7 +142,7 @@ def test_results_go_to_an_archive_that_commits_itself(orthanc, ports, tmp_path):
     images, drawing = new_study(orthanc, tmp_path)
     service = service_with(tmp_path, replace_archive(by_get(orthanc), commitment=True))
     service.inbox.receive(file_bytes(drawing), "VIEWER")
-    with listening(service, Listener(port=ports.own, calling_ae_titles=("ORTHANC",))), service.working():
+    with service.listening(Listener(port=ports.own, calling_ae_titles=("ORTHANC",))), service.working():
         service.until_empty()
     assert len(results_in(orthanc, images[0].StudyInstanceUID)) == len(RESULTS)
     assert list(service.blobs.list("dicom/commitments/")) == []
@@ -175,7 +163,7 @@ def certificates(tmp_path) -> Tls:
 def test_associations_over_tls_need_a_certificate(orthanc, tmp_path, certificates):
     service = service_with(tmp_path, by_dicomweb(orthanc))
     (port,) = free_ports(1)
-    with listening(service, Listener(port=port, calling_ae_titles=("MORPHOFLOW",), tls=certificates)):
+    with service.listening(Listener(port=port, calling_ae_titles=("MORPHOFLOW",), tls=certificates)):
         known = associate(port, "MORPHOFLOW", tls_args=(client_context(certificates), "127.0.0.1"))
         assert known.send_c_echo().Status == 0
         known.release()
@@ -270,7 +258,7 @@ def test_an_archive_may_forward_whatever_comes(tmp_path):
     entity.add_requested_context(MRImageStorage, JPEG2000Lossless)
     for uid in sop_classes.SENT:
         entity.add_requested_context(uid)
-    with listening(service, Listener(port=port, calling_ae_titles=("PACS",))):
+    with service.listening(Listener(port=port, calling_ae_titles=("PACS",))):
         send(files, port, "MORPHOFLOW", "PACS")  # ends at the first object that is refused
         peer = entity.associate("127.0.0.1", port, ae_title="MORPHOFLOW")
         assert {context.abstract_syntax for context in peer.rejected_contexts} == set()

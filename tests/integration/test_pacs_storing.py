@@ -12,8 +12,6 @@ from pydicom import Dataset
 from benchmarks.ports import free_ports
 from service.adapters.dicom.results import RESULTS
 from service.adapters.pacs.configuration import Listener, PacsConfiguration, Rule
-from service.adapters.pacs.dimse_server import dimse_listener
-from service.pacs import Tally
 from service.pacs_ports import Disposition
 from tests.dicom_parts import file_bytes
 from tests.pacs_archives import TITLE, FakeArchive
@@ -119,8 +117,7 @@ def test_a_silent_archive_without_queries_is_asked_again_and_sent_nothing_twice(
     service = Service(tmp_path, configuration, io.StringIO())
     service.inbox.receive(file_bytes(drawing), "VIEWER")
     listener = Listener(port=port, calling_ae_titles=(TITLE,))
-    heard = dimse_listener(listener, service.inbox, service.blobs, service.audit, service.log, Tally().add)
-    with source.running(), target.running(), heard, service.working():
+    with source.running(), target.running(), service.listening(listener), service.working():
         until(lambda: len(target.requests) == 3)
         transaction, asked = target.requests[-1]
         assert len(target.stored) == len(RESULTS)

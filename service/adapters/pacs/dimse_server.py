@@ -5,6 +5,7 @@ An object is acknowledged when it is on disk and in a durable job, never before.
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from pydicom import Dataset
@@ -19,7 +20,6 @@ from service.adapters.pacs.configuration import Listener
 from service.adapters.pacs.listening import ListeningEntity
 from service.adapters.pacs.prompt_sockets import PROMPT
 from service.adapters.pacs.tls import server_context
-from service.job_ports import BlobStore
 from service.pacs_ports import Disposition, ObjectReceiver
 
 #: Status of a C-STORE (PS3.4, GG.4-1).
@@ -29,19 +29,8 @@ TITLES = 0x01
 
 
 @contextmanager
-def dimse_listener(
-    listener: Listener,
-    receiver: ObjectReceiver,
-    blobs: BlobStore,
-    audit: AuditTrail,
-    log: Any,
-    turned_away: Callable[[], object],
-) -> Iterator[None]:
-    """Accept associations while the context lasts.
-
-    Args:
-        turned_away: called for each association that is one too many.
-    """
+def dimse_listener(listener: Listener, desk: "PeerDesk") -> Iterator[None]:
+    """Accept associations while the context lasts; what they bring goes to the desk."""
     callers = listener.calling_ae_titles
     entity: Any = ListeningEntity(listener.ae_title, callers, listener.maximum_associations)
     entity.add_supported_context(sop_classes.VERIFICATION)
@@ -50,7 +39,6 @@ def dimse_listener(
     for uid in sop_classes.LEFT_ALONE:
         entity.add_supported_context(uid, list(sop_classes.LEFT_ALONE_SYNTAXES))
     entity.add_supported_context(sop_classes.COMMITMENT, scu_role=True, scp_role=True)
-    desk = _Desk(listener, receiver, blobs, audit, log, turned_away)
     handlers: list[Any] = [
         PROMPT,
         (evt.EVT_C_ECHO, lambda event: SUCCESS),
@@ -66,12 +54,12 @@ def dimse_listener(
         evt_handlers=handlers,
         contexts=_Shared(entity.supported_contexts),
     )
-    log.info("DICOM listener started", tls=context is not None)
+    desk.log.info("DICOM listener started", tls=context is not None)
     try:
         yield
     finally:
         server.shutdown()
-        log.info("DICOM listener stopped")
+        desk.log.info("DICOM listener stopped")
 
 
 class _Shared(list[PresentationContext]):
@@ -81,35 +69,36 @@ class _Shared(list[PresentationContext]):
         return self
 
 
-class _Desk:
-    """What is done with what peers send."""
+@dataclass(frozen=True)
+class PeerDesk:
+    """What is done with what peers send.
 
-    def __init__(
-        self,
-        listener: Listener,
-        receiver: ObjectReceiver,
-        blobs: BlobStore,
-        audit: AuditTrail,
-        log: Any,
-        turned_away: Callable[[], object],
-    ) -> None:
-        self._title = listener.ae_title
-        self._receiver = receiver
-        self._reports = Reports(blobs)
-        self._audit = audit
-        self._log = log
-        self._turned_away = turned_away
+    Attributes:
+        title: of the listener, in the audit trail.
+        receiver: takes objects.
+        reports: of the storage commitments that archives were asked for.
+        audit: where associations of those who are not on the list are written down.
+        log: tells what happens, without identifiers.
+        turned_away: called for each association that is one too many.
+    """
+
+    title: str
+    receiver: ObjectReceiver
+    reports: Reports
+    audit: AuditTrail
+    log: Any
+    turned_away: Callable[[], object]
 
     def store(self, event: Any) -> int:
         """C-STORE: the status that the sender is told."""
         sender = event.assoc.requestor.ae_title.strip()
         try:
-            receipt = self._receiver.receive(event.encoded_dataset(), sender)
+            receipt = self.receiver.receive(event.encoded_dataset(), sender)
         except OSError:
-            self._log.error("object cannot be kept")
+            self.log.error("object cannot be kept")
             return OUT_OF_RESOURCES
         except Exception as fault:  # noqa: BLE001 - the sender must learn that it was not kept, whatever happened
-            self._log.error("object cannot be taken", fault=type(fault).__name__)
+            self.log.error("object cannot be taken", fault=type(fault).__name__)
             return PROCESSING_FAILURE
         return CANNOT_UNDERSTAND if receipt.disposition is Disposition.QUARANTINED else SUCCESS
 
@@ -121,19 +110,17 @@ class _Desk:
             items = information.get("FailedSOPSequence") or []
             failed = frozenset(str(item.ReferencedSOPInstanceUID) for item in items)
         report = Report(failed if failed or event.event_type == 1 else None)
-        if not self._reports.take(transaction, report):
-            self._log.warning("report of a storage commitment that nobody awaits")
+        if not self.reports.take(transaction, report):
+            self.log.warning("report of a storage commitment that nobody awaits")
         return SUCCESS, None
 
     def rejected(self, event: Any) -> None:
         """An association of somebody who is not on the list, which is an alert; or one too many, which is counted."""
         if event.assoc.acceptor.primitive.result_source != TITLES:
-            self._turned_away()
-            self._log.warning("association turned away", reason="as many associations as are accepted are open")
+            self.turned_away()
+            self.log.warning("association turned away", reason="as many associations as are accepted are open")
             return
         caller = event.assoc.requestor.ae_title.strip()
         note = "An association was rejected."
-        self._audit.write(
-            AuditEntry(AuditEvent.REFUSED, caller, self._title, outcome=Outcome.SERIOUS_FAILURE, note=note)
-        )
-        self._log.warning("association rejected")
+        self.audit.write(AuditEntry(AuditEvent.REFUSED, caller, self.title, outcome=Outcome.SERIOUS_FAILURE, note=note))
+        self.log.warning("association rejected")

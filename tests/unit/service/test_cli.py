@@ -8,18 +8,15 @@ from importlib.metadata import EntryPoint
 
 import nibabel as nib
 import numpy as np
-import psycopg
 import pytest
 import trimesh
 import typer
 
-from benchmarks.ports import free_port
 from model.errors import BundleCorrupt
 from service.cli import BAD_INPUT, FAULT, build_app, command_names, example_request, interface_yaml, load_plugins, main
 from service.model_registry import BrokenModel, ModelRegistry
 from service.ports import MeshFormat
 from service.settings import Settings
-from service.stores import missing_database
 from tests.analytic_model import ellipsoid_model
 from tests.dicom_parts import file_bytes, mr_series, seg_of
 from tests.service_parts import NAME, mask_bytes, sparse_ellipsoid
@@ -274,76 +271,6 @@ def test_what_lacks_an_extra_says_how_to_install_it(words, library, setting, ext
     told = capsys.readouterr().err
     assert told.endswith(f"needs the extra {extra}: pip install -c constraints.txt '.[{extra}]'\n")
     assert told.count("\n") == 1
-
-
-@pytest.mark.parametrize("words", [("serve",), ("worker",), ("jobs", "sample")])
-@pytest.mark.parametrize(
-    ("setting", "value"),
-    [
-        ("RESULTS_FOLDER", "/proc/absent/results"),
-        ("RESULTS_FOLDER", "/proc/version"),
-        ("RESULT_LIFETIME_S", "inf"),
-        ("JOBS_DATABASE", "mysql://user:hush@host/name"),
-        ("JOBS_DATABASE", "sqlite:///:memory:"),
-        ("JOBS_DATABASE", "sqlite:////proc/absent/jobs.sqlite"),
-        ("JOBS_DATABASE", "sqlite:////proc/version"),
-        ("JOBS_DATABASE", "sqlite:////tmp"),
-        ("STORAGE_URL", "gs://bucket"),
-    ],
-)
-def test_what_nothing_can_be_kept_in_is_refused_at_the_start(words, setting, value, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("MORPHOFLOW_RESULTS_FOLDER", str(tmp_path / "results"))
-    monkeypatch.setenv(f"MORPHOFLOW_{setting}", value)
-    assert run(*words) == BAD_INPUT
-    told = capsys.readouterr().err
-    assert setting in told.upper()
-    assert value not in told
-    assert told.count("\n") == 1
-
-
-@pytest.mark.parametrize("word", ["serve", "worker"])
-def test_a_database_that_is_not_there_is_named_and_not_made(word, postgres_url, tmp_path, capsys, monkeypatch):
-    name = "absent_" + postgres_url.rpartition("_")[2]
-    monkeypatch.setenv("MORPHOFLOW_RESULTS_FOLDER", str(tmp_path / "results"))
-    monkeypatch.setenv("MORPHOFLOW_JOBS_DATABASE", f"{postgres_url.rpartition('/')[0]}/{name}")
-    assert run(word) == BAD_INPUT
-    assert f"the database {name}, which is not on its server" in capsys.readouterr().err
-    with psycopg.connect(postgres_url) as connection:
-        assert not connection.execute("SELECT 1 FROM pg_database WHERE datname = %s", [name]).fetchall()
-    assert missing_database(postgres_url) is None
-
-
-ASKING = [("jobs", word, "11111111-1111-4111-8111-111111111111") for word in ("watch", "cancel")]
-
-
-@pytest.mark.parametrize("words", ASKING)
-def test_who_only_asks_for_a_job_makes_no_database(words, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("MORPHOFLOW_RESULTS_FOLDER", str(tmp_path / "state" / "results"))
-    assert run(*words) == BAD_INPUT
-    assert capsys.readouterr().err.startswith("morphoflow: There is no job of this identifier")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("words", ASKING)
-def test_who_only_asks_for_a_job_makes_no_tables(words, postgres_url, capsys, monkeypatch):
-    monkeypatch.setenv("MORPHOFLOW_JOBS_DATABASE", postgres_url)
-    assert run(*words) == BAD_INPUT
-    assert "no job of this identifier" in capsys.readouterr().err
-    with psycopg.connect(postgres_url) as connection:
-        tables = "SELECT 1 FROM pg_tables WHERE schemaname NOT IN ('pg_catalog', 'information_schema')"
-        assert not connection.execute(tables).fetchall()
-
-
-@pytest.mark.parametrize("words", ASKING)
-def test_who_asks_for_a_job_in_what_is_no_database_is_told_so(words, tmp_path, capsys, monkeypatch):
-    (tmp_path / "jobs.sqlite").write_text("no database at all")
-    monkeypatch.setenv("MORPHOFLOW_JOBS_DATABASE", f"sqlite:///{tmp_path / 'jobs.sqlite'}")
-    assert run(*words) == BAD_INPUT
-    assert "MORPHOFLOW_JOBS_DATABASE" in capsys.readouterr().err
-
-
-def test_a_server_that_does_not_answer_is_not_one_without_the_database():
-    assert missing_database(f"postgresql://user@127.0.0.1:{free_port()}/jobs") is None
 
 
 def test_the_interface_is_written_to_a_file(tmp_path):
