@@ -145,7 +145,7 @@ def resend(
     log = make_log("error")
     with closing(open_jobs(settings)) as jobs:
         done = _resend(open_pacs(settings, settings.pacs_file, open_blobs(settings), jobs, log).inbox, names)
-    echo_json(done) if as_json else typer.echo(f"{len(done.taken)} drawings taken up again, {len(done.left)} left.")
+    echo_json(done) if as_json else typer.echo(f"Taken up again: {len(done.taken)}; left: {len(done.left)}.")
 
 
 def _resend(inbox: "Inbox", names: list[str] | None) -> Resent:
