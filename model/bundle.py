@@ -82,6 +82,8 @@ class Manifest:
             and ``training``; empty without one.
         training_masks: digests of the training masks' voxels (`training.seen`), by which no shape of the training is
             taken for a held-out one; empty where they are not known.
+        clusters: two kinds of training shapes between which nothing is drawn (`model.inference.clusters`):
+            ``direction``, ``shares``, ``means`` and ``sd``; empty where they are of one kind.
         anatomy: code of the structure, by default none: ``value``, ``scheme`` (``SCT`` for SNOMED CT) and ``meaning``.
     """
 
@@ -110,6 +112,7 @@ class Manifest:
     typical: dict[str, float] = field(default_factory=dict)
     completion: dict[str, Any] = field(default_factory=dict)
     training_masks: tuple[str, ...] = field(default_factory=tuple)
+    clusters: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ def check_values(values: Mapping[str, Any]) -> None:
             f"sigmas of the manifest are {len(values['sigmas'])}; one for each of the {values['latent_size']} "
             "dimensions of latent_size is accepted."
         )
+    _check_clusters(values.get("clusters", {}), values["latent_size"])
     for name, keys in GROUPS.items():
         group = values.get(name, {})
         if not isinstance(group, Mapping):
@@ -45,6 +46,19 @@ def check_values(values: Mapping[str, Any]) -> None:
             raise BundleCorrupt(
                 f"{name} of the manifest lacks a number for {', '.join(wrong)}; calibrate the model anew."
             )
+
+
+def _check_clusters(clusters: object, latent_size: int) -> None:
+    if clusters == {}:
+        return
+    rules = {"direction": _all(latent_size, _is_number), "shares": _all(2, _is_positive), "means": _all(2, _is_number)}
+    known = clusters if isinstance(clusters, Mapping) else {}
+    wrong = [name for name, rule in {**rules, "sd": _is_positive}.items() if not rule(known.get(name))]
+    if wrong:
+        raise BundleCorrupt(
+            f"clusters of the manifest lack {', '.join(wrong)}; a direction of {latent_size} numbers, two shares, two "
+            "means and an sd are accepted."
+        )
 
 
 def _is_number(value: object) -> bool:

@@ -14,7 +14,7 @@ from model.networks.decoder import OccupancyDecoder
 from model.networks.prior import LatentPrior
 from training.config import TrainingConfig
 from training.interruption import Interruption
-from training.objective import gaussian_entropy, reconstruction_loss
+from training.objective import gaussian_entropy, reconstruction_loss, unevenness
 from training.recorded import RecordedStep
 from training.samples import Batch, PointPool, ShapePoints
 
@@ -22,6 +22,8 @@ from training.samples import Batch, PointPool, ShapePoints
 CHECKPOINT = "checkpoint.pt"
 #: Standard deviation of the codes' noise with the denoising objective.
 NOISE = 0.1
+#: Shapes, and points near the contour of each, at which a step judges how even movements are.
+EVEN_SHAPES, EVEN_POINTS = 32, 128
 #: Called after each step with the step's number and its figures, which are read every `READ_EVERY` steps only.
 Watch = Callable[[int, dict[str, float]], None]
 #: Reading a figure makes the device wait, so it is not done each step.
@@ -80,8 +82,14 @@ class AutoDecoder(nn.Module):
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
         return mean + self.log_deviations(chosen).exp() * noise
 
-    def loss(self, chosen: Int[Tensor, "b"], batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
-        """The joint objective and its terms, means over the chosen shapes."""
+    def loss(
+        self, chosen: Int[Tensor, "b"], batch: Batch, generator: torch.Generator, near: Batch | None = None
+    ) -> dict[str, Tensor]:
+        """The joint objective and its terms, means over the chosen shapes.
+
+        Args:
+            near: points near the contours of the first of them, for the weight on isometry.
+        """
         weights = self.config.objective
         codes = self.draw_codes(chosen, generator)
         logits = self.decoder(codes, batch.points)
@@ -93,7 +101,17 @@ class AutoDecoder(nn.Module):
         total = rec + self.pressure * weights.lambda_flow * density.mean()
         if self.config.prior.use_ard:
             total = total + self.pressure * weights.lambda_ard * ard
-        return {"loss": total, "reconstruction": rec, "prior": density.mean(), "ard": ard}
+        terms = {"reconstruction": rec, "prior": density.mean(), "ard": ard}
+        if near is not None:
+            terms["unevenness"] = self._unevenness(codes[: len(near.points)], near, generator)
+            total = total + self.pressure * weights.lambda_isometry * terms["unevenness"]
+        return {"loss": total, **terms}
+
+    def _unevenness(self, codes: Float[Tensor, "b d"], near: Batch, generator: torch.Generator) -> Tensor:
+        """That of movements by one random step of the prior's spread."""
+        sigma = self.prior.sigma.detach()
+        step = sigma * torch.randn(sigma.shape, generator=generator, device=sigma.device)
+        return unevenness(*self.decoder.moved(codes, near.points, step), near.weights)
 
 
 @dataclass
@@ -137,7 +155,9 @@ class Trainer:
         size = min(config.batch_shapes, self.pool.size)
         chosen = torch.randperm(self.pool.size, generator=self.generator, device=self.pool.device)[:size]
         batch = self.pool.draw(chosen, (config.near_points, config.far_points), self.generator)
-        terms = self.module.loss(chosen, batch, self.generator)
+        even = config.objective.lambda_isometry > 0.0
+        near = self.pool.draw(chosen[:EVEN_SHAPES], (EVEN_POINTS, 0), self.generator) if even else None
+        terms = self.module.loss(chosen, batch, self.generator, near)
         self.optimiser.zero_grad(set_to_none=True)
         terms["loss"].backward()
         nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)

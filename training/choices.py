@@ -70,6 +70,7 @@ class TrainingChoice:
         flow, ard: whether they are trained along with the decoder; unless the objective is ``variational``, when None:
             codes that are Gaussians get both when training is over (`training.pruning`).
         ard_weight: of ARD; its default when None.
+        isometry: weight of movements that are the same for all shapes; 0 leaves them as they come.
         reflect: whether mirror images join; those of a cohort without sides, when None, but not in the paper's
             objective.
         steps, epochs: how long it is; the steps of the default configuration when both are None.
@@ -85,6 +86,7 @@ class TrainingChoice:
     flow: bool | None = None
     ard: bool | None = None
     ard_weight: float | None = None
+    isometry: float = 0.0
     reflect: bool | None = None
     steps: int | None = None
     epochs: int | None = None
@@ -147,6 +149,7 @@ def configured(choice: TrainingChoice, *, reflected: bool) -> "TrainingConfig":
     )
     if choice.ard_weight is not None:
         loss = replace(loss, lambda_ard=choice.ard_weight)
+    loss = replace(loss, lambda_isometry=choice.isometry)
     return replace(
         plain,
         decoder=DecoderShape(latent_size=choice.latent_size, unit_columns=not paper),

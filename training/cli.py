@@ -68,6 +68,13 @@ def train(
     ard_weight: Annotated[
         float | None, typer.Option(min=0.0, help="Of --ard; more leaves fewer dimensions alive.")
     ] = None,
+    isometry: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            help="Weight of an even latent space, where one step moves the surfaces of all shapes as far; try 2.",
+        ),
+    ] = 0.0,
     reflect: Annotated[
         bool | None,
         typer.Option(
@@ -95,6 +102,7 @@ def train(
             flow=flow,
             ard=ard,
             ard_weight=ard_weight,
+            isometry=isometry,
             reflect=reflect,
             steps=steps,
             epochs=epochs,

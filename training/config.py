@@ -26,6 +26,8 @@ class ObjectiveConfig:
         ramp: share of the steps over which `lambda_flow` and `lambda_ard` rise from 0: dimensions find a use first.
         lambda_ard: weight of the Gamma prior on the precisions.
         a, b: shape and rate of that Gamma prior; a > 1, b < 1.
+        lambda_isometry: weight of `training.objective.unevenness`: how differently one step of the code moves the
+            surfaces of different shapes. It rises along the ramp as the others do.
     """
 
     name: ObjectiveName = "variational"
@@ -35,6 +37,7 @@ class ObjectiveConfig:
     lambda_ard: float = 1e-4
     a: float = 2.0
     b: float = 1e-6
+    lambda_isometry: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from vtkmodules.vtkFiltersGeneral import vtkDistancePolyDataFilter
 
 from model.bundle import ShapeModel
 from model.geometry import Pose
+from model.inference.clusters import drawn_base
 from model.inference.mesh import Mesh
 from model.inference.surface import canonical_box, surface_of
 
@@ -65,8 +66,9 @@ def generated(
     """
     if samples == 0:
         return Generation(np.zeros(0), np.zeros(0))
-    sigmas, codes = np.asarray(model.manifest.sigmas), model.population.base_codes
-    bases = sigmas * np.random.default_rng(seed).standard_normal((samples, len(sigmas)))
+    codes = model.population.base_codes
+    stream = np.random.default_rng(seed)
+    bases = np.stack([drawn_base(model.manifest, stream)[0] for _ in range(samples)])
     latents = model.prior.from_base(bases)
     step = 2.0 * float(canonical_box(model).max()) / STEPS
     known: dict[int, Mesh] = {}

@@ -47,6 +47,27 @@ def reconstruction_loss(
     return dice + cross_entropy  # type: ignore[return-value]
 
 
+def unevenness(
+    logits: Float[Tensor, "b n"], moved: Float[Tensor, "b n"], weights: Float[Tensor, "b n"]
+) -> Float[Tensor, ""]:
+    """Variance over shapes of how far one step of the code moves their surfaces, relative to the mean.
+
+    A movement of the surface sweeps ``p (1 - p) |moved|`` of the points near it. Where it is the same for all shapes,
+    the latent space has one metric, which a linear change of coordinates makes that of the surfaces' distances
+    (isometric auto-encoders: Gropp et al. 2020). Two halves of a shape's points are multiplied, so that the scatter of
+    what was drawn of it adds nothing on average.
+
+    Args:
+        logits: at random points near each shape's surface.
+        moved: their derivatives along the step.
+    """
+    probability = torch.sigmoid(logits)
+    swept = weights * probability * (1.0 - probability) * moved.abs()
+    halves = torch.stack([swept[:, 0::2].sum(dim=1), swept[:, 1::2].sum(dim=1)])
+    relative = halves / halves.mean().clamp(min=1e-9) - 1.0
+    return (relative[0] * relative[1]).mean()
+
+
 def gaussian_entropy(log_deviation: Float[Tensor, "b d"]) -> Float[Tensor, "b"]:
     """Entropy of a diagonal Gaussian (nats)."""
     return (log_deviation + 0.5 * (1.0 + math.log(2 * math.pi))).sum(dim=-1)

@@ -2,12 +2,11 @@
 
 Started from the identity, so that the flow is never worse on the held-out codes than the Gaussian base alone. They are
 codes of shapes that the decoder was trained on, and what little a flow gains on them is not there on other shapes, but
-its bends are: distances in the base no longer say how far surfaces are apart. So it stays the identity unless it gains
-enough.
+its bends are: distances in the base no longer say how far surfaces are apart. So there is none unless it gains enough.
 """
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -77,7 +76,8 @@ def fitted_prior(
     codes (`training.shrinkage`).
 
     Returns:
-        The prior, and what its flow adds to the mean log density of the held-out codes (nats, never negative).
+        The prior, and what its flow adds to the mean log density of the held-out codes (nats); where that is too
+        little it has no flow, and 0.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -86,7 +86,7 @@ def fitted_prior(
     fitted.log_sigma.requires_grad_(False)
     held = codes.group % HELD_EVERY == 0
     if not prior.shape.use_flow or held.all() or not held.any():
-        return fitted.eval(), 0.0
+        return _without_flow(fitted), 0.0
     return _descend(fitted, codes.of(~held), codes.of(held), background, torch.Generator().manual_seed(seed))
 
 
@@ -95,8 +95,7 @@ def _descend(
 ) -> tuple[LatentPrior, float]:
     judged = torch.cat([_draws(unseen, background, generator) for _ in range(-(-JUDGED // len(unseen.mean)))])
     start = _score(prior, judged)
-    flat = copy.deepcopy(prior.flow.state_dict())
-    best, best_flow, waited = start, flat, 0
+    best, best_flow, waited = start, copy.deepcopy(prior.flow.state_dict()), 0
     optimiser = torch.optim.AdamW(prior.flow.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     for step in range(1, STEPS + 1):
         chosen = torch.randperm(len(seen.mean), generator=generator)[:BATCH]
@@ -111,9 +110,18 @@ def _descend(
             if waited == PATIENCE:
                 break
     if best - start < LEAST_GAIN * judged.shape[1]:
-        best, best_flow = start, flat
+        return _without_flow(prior), 0.0
     prior.flow.load_state_dict(best_flow)
     return prior.eval(), best - start
+
+
+@torch.no_grad()
+def _without_flow(prior: LatentPrior) -> LatentPrior:
+    """The base of a prior by itself."""
+    shape = replace(prior.shape, use_flow=False, flow=replace(prior.shape.flow, transforms=0))
+    result = LatentPrior(shape)
+    result.log_sigma.copy_(prior.log_sigma)
+    return result.requires_grad_(False).eval()
 
 
 def _draws(codes: Codes, background: Background | None, generator: torch.Generator) -> Float[Tensor, "m d"]:

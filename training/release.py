@@ -28,6 +28,7 @@ from model.networks.decoder import OccupancyDecoder
 from model.networks.export import export_graphs, quiet_exporter, torch_networks
 from model.networks.prior import LatentPrior
 from training.autodecoder import CHECKPOINT, AutoDecoder, is_ended
+from training.clusters import as_values, clusters_in
 from training.config import TrainingConfig
 from training.pruning import PriorParts, Pruned, refitted
 from training.runs import read_record
@@ -115,9 +116,12 @@ def _written(found: "Assembled", folder: Path, naming: Naming, watch: Watch) -> 
     with quiet_exporter():
         files = export_graphs(found.decoder, found.prior, folder)
     watch(STAGES[2])
-    np.savez(folder / POPULATION, **asdict(found.population()))
+    population = found.population()
+    np.savez(folder / POPULATION, **asdict(population))
     digests = {file: file_digest(folder / file) for file in sorted([*files, POPULATION])}
-    manifest = replace(naming.on(found.manifest()), files=digests)
+    manifest = naming.on(found.manifest())
+    clusters = clusters_in(population.base_codes / np.asarray(manifest.sigmas))
+    manifest = replace(manifest, files=digests, clusters=as_values(clusters))
     write_manifest(manifest, folder)
     return manifest
 

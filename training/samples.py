@@ -54,7 +54,7 @@ class PointPool:
         near, far = (s.count[chosen] for s in self._strata)
         band = torch.where(near > 0, near, far).clamp(min=1).float()
         weights = [
-            (s.count[chosen].float() / band / n)[:, None].expand(-1, n)
+            (s.count[chosen].float() / band / max(1, n))[:, None].expand(-1, n)
             for s, n in zip(self._strata, counts, strict=True)
         ]
         points, labels = (torch.cat(values, dim=1) for values in zip(*parts, strict=True))

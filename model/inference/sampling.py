@@ -9,6 +9,7 @@ from jaxtyping import Float
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
 from model.geometry import Pose
+from model.inference.clusters import drawn_base
 from model.inference.mesh import Mesh, largest_component
 from model.inference.plausibility import counted, implausible
 from model.inference.surface import require_spacing, surface_of
@@ -17,6 +18,8 @@ from model.inference.surface import require_spacing, surface_of
 HIGHEST_TEMPERATURE = 2.0
 #: A seed is drawn from at most so often; the last draw stands, plausible or not.
 MAX_DRAWS = 16
+#: Why a draw is rejected before its surface is known.
+BETWEEN = "between_clusters"
 #: Dimensions of a smaller sigma, against the largest, are dead: draws differ there from all training codes alike.
 LEAST_SIGMA = 0.01
 
@@ -31,7 +34,7 @@ class SampledShape:
         nearest_training_distance: distance in z0, in units of sigma, over live dimensions, to the nearest
             training code.
         mesh: its surface; of several components the one of largest volume.
-        rejected: draws of the same seed before this one that were implausible, by reason.
+        rejected: draws of the same seed before this one that were implausible or between clusters, by reason.
         plausible: whether this one is; None when it was not asked.
     """
 
@@ -53,8 +56,8 @@ def draw_shape(
 ) -> SampledShape:
     """One shape, a pure function of (bundle, seed, temperature, spacing, reject).
 
-    The draws of a seed are one stream of base codes; the first that is plausible (`model.inference.plausibility`) is
-    the answer.
+    The draws of a seed are one stream of base codes; the first that lies where the training shapes are
+    (`model.inference.clusters`) and is plausible (`model.inference.plausibility`) is the answer.
 
     Args:
         seed: non-negative.
@@ -70,7 +73,8 @@ def draw_shape(
     stream = np.random.default_rng(seed)
     reasons: list[str] = []
     for _ in range(MAX_DRAWS if reject else 1):
-        base = temperature * sigmas * stream.standard_normal(len(sigmas))
+        base, thinned = drawn_base(model.manifest, stream, temperature, thin=reject)
+        reasons += [BETWEEN] * thinned
         latent = model.prior.from_base(base[None])[0]
         mesh = surface_of(model, latent, Pose(), spacing_mm, keep_specks=True)
         reason = implausible(model, mesh) if reject else None

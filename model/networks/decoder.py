@@ -102,6 +102,20 @@ class OccupancyDecoder(nn.Module):
         logits: Tensor = self.out(functional.silu(last)).squeeze(-1)
         return logits
 
+    def moved(
+        self, latent: Float[Tensor, "b d"], points: Float[Tensor, "b n 3"], step: Float[Tensor, "d"]
+    ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
+        """Logits and their derivative along a step of the latent code, by one forward pass in plain operations."""
+        before = self._pre_activations(latent, points)
+        first, second = (functional.linear(step, weights) for weights in self.latent_weights())
+        tangent = first.expand_as(before[0])
+        for number, layer in enumerate(self.hidden, start=1):
+            tangent = functional.linear(silu_slope(before[number - 1]) * tangent, layer.weight)
+            if number == self.second_entry:
+                tangent = tangent + second
+        logits = self.out(functional.silu(before[-1])).squeeze(-1)
+        return logits, functional.linear(silu_slope(before[-1]) * tangent, self.out.weight).squeeze(-1)
+
     def jacobians(
         self, latent: Float[Tensor, "b d"], points: Float[Tensor, "b n 3"]
     ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n d"], Float[Tensor, "b n 3"]]:

@@ -180,6 +180,9 @@ def test_what_a_manifest_lacks_is_named(bundle, name):
         ("posterior", {"sd_scale": None, "offset_mm": 0.1}, "sd_scale"),
         ("typical", {"freedom": 9.0}, "rarity_mean"),
         ("typical", [1.0], "figures by name"),
+        ("clusters", {"direction": [1.0, 0.0]}, "lack direction, shares, means, sd"),
+        ("clusters", {"direction": [1, 0, 0], "shares": [0.5, 0.5], "means": [-1, 1], "sd": 0}, "lack sd"),
+        ("clusters", [1.0], "a direction of 3 numbers"),
     ],
 )
 def test_a_value_that_cannot_be_is_named_with_what_is_accepted(bundle, name, value, naming):

@@ -47,7 +47,10 @@ def advanced(config: TrainingConfig, steps: int) -> Trainer:
 
 
 class TestRepeatability:
-    @pytest.mark.parametrize("objective", [PAPER, ObjectiveConfig(), ObjectiveConfig(name="denoising")])
+    @pytest.mark.parametrize(
+        "objective",
+        [PAPER, ObjectiveConfig(), ObjectiveConfig(name="denoising"), ObjectiveConfig(lambda_isometry=2.0)],
+    )
     def test_one_seed_gives_one_model_and_another_seed_another(self, objective):
         config = replace(CONFIG, objective=objective)
         one, again, other = (weights(advanced(replace(config, seed=seed), 6)) for seed in (0, 0, 1))
@@ -207,6 +210,31 @@ class TestLearning:
             mean = module.decoder(torch.zeros(1, 4), torch.from_numpy(GRID.centres()).float()[None])[0]
         blind = [dice(shape.mask(GRID), (mean > 0).numpy().reshape(GRID.shape)) for shape in ellipsoids(3, seed=99)]
         assert np.mean(found) > np.mean(blind)
+
+    @pytest.mark.slow
+    def test_isometry_makes_one_step_move_all_shapes_alike(self):
+        found = {}
+        for weight in (0.0, 2.0):
+            objective = ObjectiveConfig(lambda_isometry=weight)
+            module, figures = self.trained(replace(self.CONFIG, objective=objective))
+            assert ("unevenness" in figures[-1]) is (weight > 0.0)
+            found[weight] = self.scatter(module)
+        assert found[2.0] < 0.7 * found[0.0]
+
+    def scatter(self, module: AutoDecoder) -> float:
+        """Mean over steps of the code of the relative SD over shapes of how far their surfaces move (mm)."""
+        points = torch.from_numpy(GRID.centres()).float()
+        with torch.no_grad():
+            codes = module.code_means()
+            logits, by_latent, by_point = module.decoder.jacobians(codes, points.expand(len(codes), -1, -1))
+            slope = by_point.norm(dim=-1)
+            steps = module.prior.sigma[:, None] * torch.randn(4, 50, generator=torch.Generator().manual_seed(0))
+            near = logits.abs() < 0.7 * slope
+            moved = [
+                (row[here] @ steps).abs() / s[here, None] for row, s, here in zip(by_latent, slope, near, strict=True)
+            ]
+            lengths = torch.stack([one.mean(dim=0) for one in moved])
+        return float((lengths.std(dim=0) / lengths.mean(dim=0)).mean())
 
 
 def test_the_weight_of_the_prior_rises_along_the_ramp():

@@ -15,7 +15,7 @@ from model.networks.prior import PriorShape
 from tests.random_networks import jacobian, randomise
 from training.autodecoder import AutoDecoder
 from training.config import ObjectiveConfig, TrainingConfig, config_from_dict
-from training.objective import cross_entropy_loss, gaussian_entropy, reconstruction_loss, soft_dice_loss
+from training.objective import cross_entropy_loss, gaussian_entropy, reconstruction_loss, soft_dice_loss, unevenness
 from training.samples import Batch
 
 CONFIG = TrainingConfig(
@@ -98,6 +98,34 @@ class TestReconstruction:
         torch.testing.assert_close(dice, soft_dice_loss(logits, batch.labels, batch.weights))
         torch.testing.assert_close(entropy, cross_entropy_loss(logits, batch.labels, batch.weights))
         torch.testing.assert_close(both, dice + entropy)
+
+
+class TestUnevenness:
+    """Planes at x = 0 with a logistic profile: what moves them sweeps the same everywhere on them."""
+
+    @staticmethod
+    def swept(moves, points=4000):
+        x = 6.0 * torch.rand(len(moves), points, generator=torch.Generator().manual_seed(0)) - 3.0
+        moved = 4.0 * torch.tensor(moves)[:, None].expand_as(x)  # slope times movement
+        return unevenness(-4.0 * x, moved, torch.full_like(x, 1.0 / points)).item()
+
+    def test_equal_movements_are_even_whatever_their_direction(self):
+        assert self.swept([0.3, -0.3, 0.3, 0.3]) == pytest.approx(0.0, abs=2e-3)
+
+    def test_it_is_the_variance_of_movements_relative_to_their_mean(self):
+        moves = np.array([0.1, 0.2, 0.3, 0.4])
+        assert self.swept(moves.tolist()) == pytest.approx(moves.var() / moves.mean() ** 2, abs=0.01)
+
+    def test_few_points_add_scatter_but_nothing_on_average(self):
+        random = torch.Generator().manual_seed(1)
+        found = []
+        for _ in range(400):
+            x = 6.0 * torch.rand(8, 32, generator=random) - 3.0
+            found.append(unevenness(-4.0 * x, torch.ones_like(x), torch.ones_like(x)).item())
+        assert abs(np.mean(found)) < 3.0 * np.std(found) / 20.0 + 0.01
+
+    def test_a_decoder_that_does_not_move_yet_has_a_finite_one(self):
+        assert self.swept([0.0, 0.0]) == pytest.approx(1.0)
 
 
 def test_entropy_is_that_of_a_diagonal_gaussian():

@@ -39,6 +39,7 @@ def test_codes_of_the_gaussian_itself_leave_little_to_learn():
     codes = codes_of(torch.randn(60, 2, generator=torch.Generator().manual_seed(3)))
     fitted, gain = fitted_prior(prior_of(), codes)
     assert gain == 0.0
+    assert not fitted.shape.use_flow
     with torch.no_grad():
         torch.testing.assert_close(fitted.to_base(codes.mean)[0], codes.mean)
 

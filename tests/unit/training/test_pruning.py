@@ -200,9 +200,18 @@ class TestRefitted:
         trained = module.code_means() / module.prior.sigma
         torch.testing.assert_close(turned @ turned.T, trained @ trained.T, atol=1e-3, rtol=1e-3)
 
-    @pytest.mark.parametrize("flow", [True, False])
-    def test_a_flow_is_there_when_it_is_asked_for(self, flow):
-        assert refitted(module_of(), SHAPES, HALF_MM, PriorParts(flow=flow)).prior.shape.use_flow is flow
+    @pytest.mark.parametrize(
+        ("flow", "bent", "there"), [(True, True, True), (False, True, False), (True, False, False)]
+    )
+    def test_a_flow_is_there_when_it_is_asked_for_and_has_something_to_say(self, flow, bent, there):
+        module = module_of(shapes=200)
+        if bent:
+            with torch.no_grad():
+                module.mean[:, 2] = module.mean[:, 0].square() - 1.0
+                module.mean[:, 5] = module.mean[:, 3].square() - 1.0
+        found = refitted(module, 200, HALF_MM, PriorParts(flow=flow))
+        assert found.prior.shape.use_flow is there
+        assert (found.flow_gain > 0.0) is there
 
     def test_half_of_a_prior_that_stood_still_stays(self):
         module = module_of(ard=False)

@@ -44,6 +44,18 @@ def test_logits_of_both_ways_are_equal():
     torch.testing.assert_close(decoder.jacobians(latent, points)[0], decoder(latent, points))
 
 
+@pytest.mark.parametrize("depth", [2, 3, 4, 7])
+@pytest.mark.parametrize("unit_columns", [True, False])
+def test_the_derivative_along_a_step_is_the_jacobian_times_it(depth, unit_columns):
+    decoder = decoder_of(depth=depth, unit_columns=unit_columns)
+    latent, points = inputs()
+    step = torch.randn(5, generator=torch.Generator().manual_seed(9)).double()
+    logits, moved = decoder.moved(latent, points, step)
+    expected, by_latent, _ = decoder.jacobians(latent, points)
+    torch.testing.assert_close(logits, expected)
+    torch.testing.assert_close(moved, by_latent @ step)
+
+
 def test_latent_weights_have_unit_norm_over_both_entries():
     weights = torch.cat(decoder_of().latent_weights())
     torch.testing.assert_close(weights.norm(dim=0), torch.ones(5).double())
