@@ -27,7 +27,8 @@ class ObjectiveConfig:
         lambda_ard: weight of the Gamma prior on the precisions.
         a, b: shape and rate of that Gamma prior; a > 1, b < 1.
         lambda_isometry: weight of `training.objective.unevenness`: how differently one step of the code moves the
-            surfaces of different shapes. It rises along the ramp as the others do.
+            surfaces of different shapes. It rises from 0 between the shares `isometry_start` and `isometry_full` of the
+            steps: shapes come first.
     """
 
     name: ObjectiveName = "variational"
@@ -38,6 +39,8 @@ class ObjectiveConfig:
     a: float = 2.0
     b: float = 1e-6
     lambda_isometry: float = 0.0
+    isometry_start: float = 0.5
+    isometry_full: float = 0.7
 
 
 @dataclass(frozen=True)

@@ -216,10 +216,10 @@ class TestLearning:
         found = {}
         for weight in (0.0, 2.0):
             objective = ObjectiveConfig(lambda_isometry=weight)
-            module, figures = self.trained(replace(self.CONFIG, objective=objective))
+            module, figures = self.trained(replace(self.CONFIG, steps=600, objective=objective))
             assert ("unevenness" in figures[-1]) is (weight > 0.0)
             found[weight] = self.scatter(module)
-        assert found[2.0] < 0.7 * found[0.0]
+        assert found[2.0] < 0.5 * found[0.0]
 
     def scatter(self, module: AutoDecoder) -> float:
         """Mean over steps of the code of the relative SD over shapes of how far their surfaces move (mm)."""
@@ -244,3 +244,21 @@ def test_the_weight_of_the_prior_rises_along_the_ramp():
         trainer.advance()
         found.append(trainer.module.pressure.item())
     assert found == pytest.approx([min(1.0, step / (0.5 * CONFIG.steps)) for step in range(CONFIG.steps)])
+
+
+def test_movements_are_made_even_when_shapes_are_there_and_a_checkpoint_goes_on_alike(tmp_path):
+    objective = ObjectiveConfig(lambda_isometry=1.0, isometry_start=0.5, isometry_full=0.75)
+    config = replace(CONFIG, objective=objective)
+    trainer, levelling, judged = Trainer.start(config, cohort()), [], []
+    for step in range(CONFIG.steps):
+        if step == CONFIG.steps // 2 + 2:
+            trainer.save(tmp_path / "checkpoint.pt")
+        judged.append("unevenness" in trainer.advance())
+        levelling.append(trainer.module.levelling.item())
+    np.testing.assert_allclose(levelling[9:16], [0.0, 0.0, 0.2, 0.4, 0.6, 0.8, 1.0], atol=1e-6)
+    assert judged == [False] * 10 + [True] * 10
+    resumed = Trainer.start(config, cohort())
+    resumed.load(tmp_path / "checkpoint.pt")
+    while not resumed.at_end():
+        resumed.advance()
+    assert same(weights(trainer), weights(resumed))
