@@ -39,8 +39,8 @@ class ObjectiveConfig:
     a: float = 2.0
     b: float = 1e-6
     lambda_isometry: float = 0.0
-    isometry_start: float = 0.5
-    isometry_full: float = 0.7
+    isometry_start: float = 0.25
+    isometry_full: float = 0.5
 
 
 @dataclass(frozen=True)
