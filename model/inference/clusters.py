@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import norm
 
 from model.bundle import Manifest
 
@@ -48,8 +47,8 @@ class Clusters:
 
     def _ratio(self, at: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
         """Density of the codes by that of the base."""
-        parts = [share * norm.pdf(at, mean, self.sd) for share, mean in zip(self.shares, self.means, strict=True)]
-        return np.asarray(np.sum(parts, axis=0) / norm.pdf(at))
+        exponents = [0.5 * (at**2 - ((at - mean) / self.sd) ** 2) for mean in self.means]
+        return np.asarray(sum(share / self.sd * np.exp(e) for share, e in zip(self.shares, exponents, strict=True)))
 
     @cached_property
     def _largest(self) -> float:
