@@ -38,17 +38,17 @@ class AutoDecoder(nn.Module):
 
     Attributes:
         pressure: factor on `lambda_flow` and `lambda_ard` of the objective, from 0 to 1.
-        levelling: factor on `lambda_isometry`, from 0 to 1.
+        isometry_pressure: factor on `lambda_isometry`, from 0 to 1.
     """
 
     pressure: Tensor
-    levelling: Tensor
+    isometry_pressure: Tensor
 
     def __init__(self, config: TrainingConfig, shapes: int) -> None:
         super().__init__()
         self.config = config
         self.register_buffer("pressure", torch.ones(()), persistent=False)
-        self.register_buffer("levelling", torch.ones(()), persistent=False)
+        self.register_buffer("isometry_pressure", torch.ones(()), persistent=False)
         self.decoder = OccupancyDecoder(config.decoder)
         self.prior = LatentPrior(config.prior)
         size = config.decoder.latent_size
@@ -107,14 +107,14 @@ class AutoDecoder(nn.Module):
         terms = {"reconstruction": rec, "prior": density.mean(), "ard": ard}
         if near is not None:
             terms["unevenness"] = self._unevenness(codes[: len(near.points)], near, generator)
-            total = total + self.levelling * weights.lambda_isometry * terms["unevenness"]
+            total = total + self.isometry_pressure * weights.lambda_isometry * terms["unevenness"]
         return {"loss": total, **terms}
 
     def _unevenness(self, codes: Float[Tensor, "b d"], near: Batch, generator: torch.Generator) -> Tensor:
         """That of movements by one random step of the prior's spread."""
         sigma = self.prior.sigma.detach()
         step = sigma * torch.randn(sigma.shape, generator=generator, device=sigma.device)
-        return unevenness(*self.decoder.moved(codes, near.points, step), near.weights)
+        return unevenness(*self.decoder.directional_derivative(codes, near.points, step), near.weights)
 
 
 @dataclass
@@ -144,20 +144,20 @@ class Trainer:
     def advance(self, *, read: bool = True) -> dict[str, float]:
         """One optimiser step; returns its figures, or none when they are not to be read from the device."""
         self._schedule()
-        if self._levels is not self._recorded_levels:
+        if self._isometric is not self._recorded_isometry:
             self._make_ready()
         terms = self._advance_module()
         self.step += 1
         return {name: value.item() for name, value in terms.items()} if read else {}
 
     @property
-    def _levels(self) -> bool:
+    def _isometric(self) -> bool:
         """Whether movements are made even at this step."""
         objective = self.config.objective
         return objective.lambda_isometry > 0.0 and self.step >= objective.isometry_start * self.config.steps
 
     def _make_ready(self) -> None:
-        self._recorded_levels = self._levels
+        self._recorded_isometry = self._isometric
         on_gpu = self.pool.device.type == "cuda"
         self._advance_module = RecordedStep(self.update, self.generator) if on_gpu else self.update
 
@@ -167,7 +167,7 @@ class Trainer:
         size = min(config.batch_shapes, self.pool.size)
         chosen = torch.randperm(self.pool.size, generator=self.generator, device=self.pool.device)[:size]
         batch = self.pool.draw(chosen, (config.near_points, config.far_points), self.generator)
-        near = self.pool.draw(chosen[:EVEN_SHAPES], (EVEN_POINTS, 0), self.generator) if self._levels else None
+        near = self.pool.draw(chosen[:EVEN_SHAPES], (EVEN_POINTS, 0), self.generator) if self._isometric else None
         terms = self.module.loss(chosen, batch, self.generator, near)
         self.optimiser.zero_grad(set_to_none=True)
         terms["loss"].backward()
@@ -184,7 +184,7 @@ class Trainer:
         ramp = self.config.objective.ramp
         self.module.pressure.fill_(min(1.0, progress / ramp) if ramp > 0 else 1.0)
         first, last = self.config.objective.isometry_start, self.config.objective.isometry_full
-        self.module.levelling.fill_(min(1.0, max(0.0, progress - first) / (last - first)))
+        self.module.isometry_pressure.fill_(min(1.0, max(0.0, progress - first) / (last - first)))
         rise = min(1.0, progress / self.config.warm_up) if self.config.warm_up > 0 else 1.0
         factor = rise * 0.5 * (1.0 + math.cos(math.pi * progress))
         for group in self.optimiser.param_groups:

@@ -4,12 +4,11 @@ Two Gaussians of one covariance (McLachlan and Peel 2000) are fitted by expectat
 random directions. They are believed where left-out codes are surely more probable under them than under one Gaussian.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Bool, Float, Int
+from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
 from model.inference.clusters import Clusters
@@ -30,6 +29,7 @@ class Mixture:
 
     Attributes:
         shares: (k,) that add up to 1.
+        means, covariance: in the unit of the codes, and its square.
     """
 
     shares: Float[np.ndarray, "k"]
@@ -37,12 +37,12 @@ class Mixture:
     covariance: Float[np.ndarray, "d d"]
 
     def log_parts(self, codes: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n k"]:
-        """Logarithms of each part's share of the density."""
-        factor = cho_factor(self.covariance, lower=True)
-        away = codes[:, None] - self.means
-        squares = np.sum(away * cho_solve(factor, away.reshape(-1, codes.shape[1]).T).T.reshape(away.shape), axis=-1)
-        log_root = np.log(np.diag(factor[0])).sum()
-        return np.asarray(np.log(self.shares) - 0.5 * (squares + codes.shape[1] * np.log(2.0 * np.pi)) - log_root)
+        """Logarithms of each part's share of the density (nats)."""
+        root = np.linalg.cholesky(self.covariance)
+        white, centres = (solve_triangular(root, rows.T, lower=True) for rows in (codes, self.means))
+        squares = np.square(white[:, :, None] - centres[:, None]).sum(axis=0)
+        constant = np.log(np.diag(root)).sum() + 0.5 * codes.shape[1] * np.log(2.0 * np.pi)
+        return np.asarray(np.log(self.shares) - 0.5 * squares - constant)
 
     def log_density(self, codes: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
         """Of each code (nats)."""
@@ -57,14 +57,15 @@ class Mixture:
         return Mixture(sizes / len(codes), means, inner)
 
 
-def clusters_in(standard: Float[np.ndarray, "n d"]) -> Clusters | None:
+def clusters_in(standard: Float[np.ndarray, "n d"], shapes: int) -> Clusters | None:
     """Two clusters of codes, or None where they are of one kind or too few to tell.
 
     Args:
         standard: base codes over their sigmas.
+        shapes: number of training shapes; codes beyond are those of their mirror images, in the same order, and are
+            left out with them.
     """
-    count, size = standard.shape
-    if count < CODES_EACH * size or not _surely_two(standard):
+    if shapes < CODES_EACH * standard.shape[1] or not _surely_two(standard, shapes):
         return None
     found = two_parts(standard)
     towards = np.linalg.solve(found.covariance, found.means[1] - found.means[0])
@@ -92,25 +93,18 @@ def _from(codes: Float[np.ndarray, "n d"], along: Float[np.ndarray, "n"]) -> Mix
     return mixture
 
 
-def _surely_two(codes: Float[np.ndarray, "n d"]) -> bool:
-    fold = np.random.default_rng(0).permutation(len(codes)) % FOLDS
+def _surely_two(codes: Float[np.ndarray, "n d"], shapes: int) -> bool:
+    fold = folds(len(codes), shapes)
     gains = np.concatenate([_gain(codes[fold != left], codes[fold == left]) for left in range(FOLDS)])
     return bool(gains.mean() > SURE * gains.std(ddof=1) / np.sqrt(len(gains)))
+
+
+def folds(count: int, shapes: int) -> Int[np.ndarray, "n"]:
+    """In which part each code is left out; a shape and its mirror image are together."""
+    return np.asarray((np.random.default_rng(0).permutation(shapes) % FOLDS)[np.arange(count) % shapes])
 
 
 def _gain(seen: Float[np.ndarray, "n d"], unseen: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m"]:
     """What two clusters add to the log density of unseen codes (nats)."""
     one = Mixture.of(seen, np.ones((len(seen), 1)))
     return np.asarray(two_parts(seen).log_density(unseen) - one.log_density(unseen))
-
-
-def as_values(clusters: Clusters | None) -> dict[str, Sequence[float] | float]:
-    """As the manifest holds them."""
-    if clusters is None:
-        return {}
-    return {
-        "direction": clusters.direction.tolist(),
-        "shares": list(clusters.shares),
-        "means": list(clusters.means),
-        "sd": clusters.sd,
-    }

@@ -1,8 +1,8 @@
 """Generated shapes against the training shapes: the protocol of the MorphoFlow paper.
 
-For each of 1500 shapes drawn from the base Gaussian: its distance in z0 to the nearest training code, and the distance
-between its surface and that training shape's, the mean of both directions. Pearson's r of the two and its square are
-reported.
+For each of 1500 shapes drawn from the base Gaussian, none of them between two clusters of codes
+(`model.inference.clusters`): its distance in z0 to the nearest training code, and the distance between its surface and
+that training shape's, the mean of both directions. Pearson's r of the two and its square are reported.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from vtkmodules.vtkFiltersGeneral import vtkDistancePolyDataFilter
 
 from model.bundle import ShapeModel
 from model.geometry import Pose
-from model.inference.clusters import drawn_base
+from model.inference.clusters import clusters_of, drawn_base
 from model.inference.mesh import Mesh
 from model.inference.surface import canonical_box, surface_of
 
@@ -66,9 +66,9 @@ def generated(
     """
     if samples == 0:
         return Generation(np.zeros(0), np.zeros(0))
-    codes = model.population.base_codes
-    stream = np.random.default_rng(seed)
-    bases = np.stack([drawn_base(model.manifest, stream)[0] for _ in range(samples)])
+    sigmas, codes = np.asarray(model.manifest.sigmas), model.population.base_codes
+    stream, clusters = np.random.default_rng(seed), clusters_of(model.manifest)
+    bases = np.stack([drawn_base(sigmas, clusters, stream)[0] for _ in range(samples)])
     latents = model.prior.from_base(bases)
     step = 2.0 * float(canonical_box(model).max()) / STEPS
     known: dict[int, Mesh] = {}

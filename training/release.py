@@ -28,7 +28,7 @@ from model.networks.decoder import OccupancyDecoder
 from model.networks.export import export_graphs, quiet_exporter, torch_networks
 from model.networks.prior import LatentPrior
 from training.autodecoder import CHECKPOINT, AutoDecoder, is_ended
-from training.clusters import as_values, clusters_in
+from training.clusters import clusters_in
 from training.config import TrainingConfig
 from training.pruning import PriorParts, Pruned, refitted
 from training.runs import read_record
@@ -120,8 +120,8 @@ def _written(found: "Assembled", folder: Path, naming: Naming, watch: Watch) -> 
     np.savez(folder / POPULATION, **asdict(population))
     digests = {file: file_digest(folder / file) for file in sorted([*files, POPULATION])}
     manifest = naming.on(found.manifest())
-    clusters = clusters_in(population.base_codes / np.asarray(manifest.sigmas))
-    manifest = replace(manifest, files=digests, clusters=as_values(clusters))
+    clusters = clusters_in(population.base_codes / np.asarray(manifest.sigmas), len(found.record["train"]))
+    manifest = replace(manifest, files=digests, clusters={} if clusters is None else clusters.as_values())
     write_manifest(manifest, folder)
     return manifest
 

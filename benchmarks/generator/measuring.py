@@ -13,7 +13,7 @@ from benchmarks.generator.principal import drawn, principal_modes, projected
 from benchmarks.generator.surfaces import Surface, decoded, distance_mm, nearest_mm, surface_of_mask
 from benchmarks.generator.table import Figure
 from model.bundle import ShapeModel
-from model.inference.clusters import drawn_base
+from model.inference.clusters import clusters_of, drawn_base
 from model.inference.modes import shape_modes
 from model.inference.sampling import draw_shape
 from training.cohorts.cohort import Case, Cohort
@@ -40,7 +40,7 @@ class Plan:
     seed: int = 0
 
 
-#: Surfaces of draws of the prior, none rejected; None where there is none.
+#: Surfaces of draws of the prior, none rejected for what it is; None where there is none.
 Draws = Sequence[Surface | None]
 
 
@@ -65,8 +65,9 @@ def measured(model: ShapeModel, cohort: Cohort, held_out: Sequence[Case], plan: 
 
 
 def draw_all(model: ShapeModel, plan: Plan) -> Draws:
-    """Draws of consecutive seeds as the service makes them, without rejection."""
-    base = [drawn_base(model.manifest, np.random.default_rng(seed))[0] for seed in range(plan.samples)]
+    """Draws of consecutive seeds as the service makes them; none is rejected for its surface."""
+    sigmas, clusters = np.asarray(model.manifest.sigmas), clusters_of(model.manifest)
+    base = [drawn_base(sigmas, clusters, np.random.default_rng(seed))[0] for seed in range(plan.samples)]
     return [decoded(model, model.prior.from_base(row[None])[0], plan.spacing_mm) for row in base]
 
 

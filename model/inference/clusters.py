@@ -10,13 +10,14 @@ discriminant).
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from model.bundle import Manifest
 
-#: Where the largest ratio of the densities is looked for, in SDs of the base.
+#: Where the largest ratio of the densities is looked for (SDs of the base).
 RANGE = np.linspace(-6.0, 6.0, 1201)
 #: So many draws in a row are thinned out at most; the next one stands.
 MOST_THINNED = 200
@@ -50,6 +51,11 @@ class Clusters:
         exponents = [0.5 * (at**2 - ((at - mean) / self.sd) ** 2) for mean in self.means]
         return np.asarray(sum(share / self.sd * np.exp(e) for share, e in zip(self.shares, exponents, strict=True)))
 
+    def as_values(self) -> dict[str, Any]:
+        """As a manifest holds them; inverse of `clusters_of`."""
+        values = {"direction": self.direction.tolist(), "shares": list(self.shares), "means": list(self.means)}
+        return {**values, "sd": self.sd}
+
     @cached_property
     def _largest(self) -> float:
         return float(self._ratio(RANGE).max())
@@ -65,15 +71,15 @@ def clusters_of(manifest: Manifest) -> Clusters | None:
 
 
 def drawn_base(
-    manifest: Manifest, stream: np.random.Generator, temperature: float = 1.0, *, thin: bool = True
+    sigmas: Float[np.ndarray, "d"], clusters: Clusters | None, stream: np.random.Generator, temperature: float = 1.0
 ) -> tuple[Float[np.ndarray, "d"], int]:
     """Base coordinates of one draw, and how many before it lay between clusters.
 
     Args:
-        temperature: factor on the standard deviations of the base.
-        thin: leave out draws between clusters.
+        sigmas: standard deviations of the base.
+        clusters: None thins nothing out.
+        temperature: factor on the standard deviations.
     """
-    clusters, sigmas = clusters_of(manifest) if thin else None, np.asarray(manifest.sigmas)
     thinned = 0
     while True:
         standard = temperature * stream.standard_normal(len(sigmas))

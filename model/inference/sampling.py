@@ -9,7 +9,7 @@ from jaxtyping import Float
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
 from model.geometry import Pose
-from model.inference.clusters import drawn_base
+from model.inference.clusters import clusters_of, drawn_base
 from model.inference.mesh import Mesh, largest_component
 from model.inference.plausibility import counted, implausible
 from model.inference.surface import require_spacing, surface_of
@@ -71,9 +71,10 @@ def draw_shape(
     _check(seed, temperature, spacing_mm)
     sigmas = np.asarray(model.manifest.sigmas)
     stream = np.random.default_rng(seed)
+    clusters = clusters_of(model.manifest) if reject else None
     reasons: list[str] = []
     for _ in range(MAX_DRAWS if reject else 1):
-        base, thinned = drawn_base(model.manifest, stream, temperature, thin=reject)
+        base, thinned = drawn_base(sigmas, clusters, stream, temperature)
         reasons += [BETWEEN] * thinned
         latent = model.prior.from_base(base[None])[0]
         mesh = surface_of(model, latent, Pose(), spacing_mm, keep_specks=True)

@@ -102,10 +102,16 @@ class OccupancyDecoder(nn.Module):
         logits: Tensor = self.out(functional.silu(last)).squeeze(-1)
         return logits
 
-    def moved(
+    def directional_derivative(
         self, latent: Float[Tensor, "b d"], points: Float[Tensor, "b n 3"], step: Float[Tensor, "d"]
     ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
-        """Logits and their derivative along a step of the latent code, by one forward pass in plain operations."""
+        """Logits and their derivative along a step of the latent code, by one forward pass in plain operations.
+
+        Args:
+            latent: one code a shape.
+            points: canonical frame, mm.
+            step: the direction, the same for all shapes; the derivative is for the whole of it.
+        """
         before = self._pre_activations(latent, points)
         first, second = (functional.linear(step, weights) for weights in self.latent_weights())
         tangent = first.expand_as(before[0])

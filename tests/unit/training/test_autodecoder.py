@@ -249,13 +249,13 @@ def test_the_weight_of_the_prior_rises_along_the_ramp():
 def test_movements_are_made_even_when_shapes_are_there_and_a_checkpoint_goes_on_alike(tmp_path):
     objective = ObjectiveConfig(lambda_isometry=1.0, isometry_start=0.5, isometry_full=0.75)
     config = replace(CONFIG, objective=objective)
-    trainer, levelling, judged = Trainer.start(config, cohort()), [], []
+    trainer, isometry_pressure, judged = Trainer.start(config, cohort()), [], []
     for step in range(CONFIG.steps):
         if step == CONFIG.steps // 2 + 2:
             trainer.save(tmp_path / "checkpoint.pt")
         judged.append("unevenness" in trainer.advance())
-        levelling.append(trainer.module.levelling.item())
-    np.testing.assert_allclose(levelling[9:16], [0.0, 0.0, 0.2, 0.4, 0.6, 0.8, 1.0], atol=1e-6)
+        isometry_pressure.append(trainer.module.isometry_pressure.item())
+    np.testing.assert_allclose(isometry_pressure[9:16], [0.0, 0.0, 0.2, 0.4, 0.6, 0.8, 1.0], atol=1e-6)
     assert judged == [False] * 10 + [True] * 10
     resumed = Trainer.start(config, cohort())
     resumed.load(tmp_path / "checkpoint.pt")

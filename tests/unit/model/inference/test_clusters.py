@@ -17,18 +17,12 @@ SIGMAS = np.asarray(MODEL.manifest.sigmas)
 
 
 def manifest_with(clusters):
-    values = {
-        "direction": clusters.direction.tolist(),
-        "shares": list(clusters.shares),
-        "means": list(clusters.means),
-        "sd": clusters.sd,
-    }
-    return replace(MODEL.manifest, clusters=values)
+    return replace(MODEL.manifest, clusters=clusters.as_values())
 
 
-def draws(manifest, count, temperature=1.0):
+def draws(clusters, count, temperature=1.0):
     stream = np.random.default_rng(5)
-    return np.stack([drawn_base(manifest, stream, temperature)[0] for _ in range(count)]) / SIGMAS
+    return np.stack([drawn_base(SIGMAS, clusters, stream, temperature)[0] for _ in range(count)]) / SIGMAS
 
 
 def mixture_cdf(at, clusters):
@@ -38,10 +32,16 @@ def mixture_cdf(at, clusters):
 
 @pytest.mark.parametrize("clusters", [TWO, Clusters(ALONG, (0.2, 0.8), (-1.7, 0.42), 0.5)])
 def test_draws_are_the_mixture_along_the_direction_and_the_base_across_it(clusters):
-    found = draws(manifest_with(clusters), 2000)
+    found = draws(clusters, 2000)
     assert kstest(found @ ALONG, lambda at: mixture_cdf(at, clusters)).pvalue > 0.01
     across = np.stack([found[:, 1], found @ np.array([0.8, 0.0, -0.6])])
     assert kstest(across.ravel(), "norm").pvalue > 0.01
+
+
+def test_a_manifest_holds_them_whole():
+    found = clusters_of(manifest_with(TWO))
+    np.testing.assert_array_equal(found.direction, TWO.direction)
+    assert (found.shares, found.means, found.sd) == (TWO.shares, TWO.means, TWO.sd)
 
 
 def test_one_gaussian_thins_nothing():
@@ -52,20 +52,20 @@ def test_one_gaussian_thins_nothing():
 def test_a_model_of_one_kind_draws_from_its_base():
     assert clusters_of(MODEL.manifest) is None
     expected = SIGMAS * np.random.default_rng(3).standard_normal(3)
-    base, thinned = drawn_base(MODEL.manifest, np.random.default_rng(3))
+    base, thinned = drawn_base(SIGMAS, None, np.random.default_rng(3))
     np.testing.assert_array_equal(base, expected)
     assert thinned == 0
 
 
 @pytest.mark.parametrize("temperature", [0.5, 2.0])
 def test_few_draws_of_any_temperature_lie_between_the_clusters(temperature):
-    between = np.mean(np.abs(draws(manifest_with(TWO), 500, temperature) @ ALONG) < 0.2)
+    between = np.mean(np.abs(draws(TWO, 500, temperature) @ ALONG) < 0.2)
     assert between < 0.5 * (2.0 * norm.cdf(0.2 / temperature) - 1.0)
 
 
 def test_a_gap_that_holds_every_draw_ends_all_the_same():
-    nowhere = manifest_with(Clusters(ALONG, (0.5, 0.5), (-5.0, 5.0), 0.01))
-    assert drawn_base(nowhere, np.random.default_rng(0))[1] == MOST_THINNED
+    nowhere = Clusters(ALONG, (0.5, 0.5), (-5.0, 5.0), 0.01)
+    assert drawn_base(SIGMAS, nowhere, np.random.default_rng(0))[1] == MOST_THINNED
 
 
 def test_samples_count_what_was_thinned_out_and_are_the_seeds_own():

@@ -50,7 +50,7 @@ def test_the_derivative_along_a_step_is_the_jacobian_times_it(depth, unit_column
     decoder = decoder_of(depth=depth, unit_columns=unit_columns)
     latent, points = inputs()
     step = torch.randn(5, generator=torch.Generator().manual_seed(9)).double()
-    logits, moved = decoder.moved(latent, points, step)
+    logits, moved = decoder.directional_derivative(latent, points, step)
     expected, by_latent, _ = decoder.jacobians(latent, points)
     torch.testing.assert_close(logits, expected)
     torch.testing.assert_close(moved, by_latent @ step)
