@@ -69,8 +69,9 @@ class Manifest:
             ``surface_sd_exponent`` in the number of planes; not judged when empty.
         posterior: ``sd_scale``, the factor on posterior SDs of the surface, and ``offset_mm``, the SD of an error that
             the whole surface shares (`model.inference.uncertainty`), estimated on validation shapes, and
-            ``vertex_ratio``, that of errors to SDs of vertices, which is told and not used; SDs are taken as they are
-            when empty.
+            ``vertex_ratio``, that of errors to SDs of vertices, which is told and not used; and ``sharpness``, the
+            factor on logits before probabilities are taken of them, 1 when it is not there. SDs and logits are taken as
+            they are when empty.
         typical: what real shapes look like to the model (`model.inference.typicality`), from sound drawings of
             validation shapes; judged by the density of training codes alone when empty.
         training: cohort, cases, regime, command and so on.

@@ -16,6 +16,8 @@ GROUPS = {
         "slice_mean", "slice_sd",
     ),
 }  # fmt: skip
+#: What need not be there, but is a positive number where it is.
+OPTIONAL = {"posterior": ("sharpness",)}
 SIDES = ("left", "right", "mixed", "unpaired")
 
 
@@ -42,6 +44,7 @@ def check_values(values: Mapping[str, Any]) -> None:
         if not isinstance(group, Mapping):
             raise BundleCorrupt(f"{name} of the manifest is {_shown(group)}; figures by name are accepted.")
         wrong = [key for key in keys if not _is_number(group.get(key))] if group else []
+        wrong += [key for key in OPTIONAL.get(name, ()) if key in group and not _is_positive(group[key])]
         if wrong:
             raise BundleCorrupt(
                 f"{name} of the manifest lacks a number for {', '.join(wrong)}; calibrate the model anew."

@@ -293,13 +293,14 @@ def calibrate(
             "fidelity": best.fidelity,
             "spread_mm": spread_mm,
             "posterior": manifest.posterior,
-            "error_by_precision_and_fidelity": chosen.errors(),
-            "cross_entropy_by_spread": manifest.calibration["cross_entropy_by_spread"],
+            "error_by_precision_and_fidelity": chosen.as_facts(),
+            **{name: manifest.calibration[name] for name in ("cross_entropy_by_spread", "cross_entropy_by_sharpness")},
             **({} if share is None else {"completion_share": share}),
         }
         words = (
             f"likelihood precision {best.precision:g} per mm^2, fidelity {best.fidelity:g}, "
-            f"spread {spread_mm:g} mm ({100.0 * chosen.scores[best].error:.2f} % of voxels near the surface wrong)"
+            f"spread {spread_mm:g} mm, sharpness {manifest.posterior['sharpness']:g} "
+            f"({100.0 * chosen.errors[best]:.2f} % of voxels near the surface wrong)"
             + ("" if share is None else f", completed drawings count {share:g}")
         )
         typer.echo(json.dumps(summary) if as_json else words)

@@ -123,9 +123,11 @@ def open_variance(fit: Fit, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
     return fit.discrepancy.slope**2 * fit.discrepancy.variance(fit.pose.to_canonical(points))
 
 
-def mean_probability(logits: Float[np.ndarray, "n"], variance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Expected sigmoid of a Gaussian logit (MacKay 1992, equation 10)."""
-    return np.asarray(expit(logits / np.sqrt(1.0 + np.pi * variance / 8.0)))
+def mean_probability(
+    logits: Float[np.ndarray, "n"], variance: Float[np.ndarray, "n"], sharpness: float = 1.0
+) -> Float[np.ndarray, "n"]:
+    """Expected sigmoid of a Gaussian logit, multiplied by the sharpness (MacKay 1992, equation 10)."""
+    return np.asarray(expit(sharpness * logits / np.sqrt(1.0 + np.pi * sharpness**2 * variance / 8.0)))
 
 
 def normal_displacements(

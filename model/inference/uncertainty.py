@@ -96,6 +96,14 @@ def calibrated_scale(model: ShapeModel) -> tuple[float, float]:
     return known.get("sd_scale", 1.0), known.get("offset_mm", 0.0)
 
 
+def sharpness_of(model: ShapeModel) -> float:
+    """Factor on logits of a posterior before probabilities are taken of them.
+
+    By themselves they are soft by what codes do not tell, and part of that doubt is the posterior's.
+    """
+    return model.manifest.posterior.get("sharpness", 1.0)
+
+
 def uncalibrated(model: ShapeModel, sd_mm: Float[np.ndarray, "v"]) -> Float[np.ndarray, "v"]:
     """Posterior SD of vertices (mm) before `calibrated_scale` widened or narrowed it."""
     scale, offset = calibrated_scale(model)
@@ -152,7 +160,7 @@ def _piece(model: ShapeModel, state: ShapeState, points: Float[np.ndarray, "n 3"
         near = points[is_open]
         centre, by_parameter, _ = fitted_jacobians(model, found, near)
         variance = logit_variance(by_parameter, state.covariance) + open_variance(found, near)
-        result[is_open] = mean_probability(centre, variance)
+        result[is_open] = mean_probability(centre, variance, sharpness_of(model))
     return result
 
 
@@ -179,7 +187,8 @@ def _member_probabilities(
     inside = model_logits(model, state.fits[0], points) > 0
     near = _near_border(inside, index, grid.spacing)
     result = inside.astype(float)
-    members = [_sigmoid(fitted_logits(model, member, points[near])) for member in state.members]
+    sharpness = sharpness_of(model)
+    members = [_sigmoid(sharpness * fitted_logits(model, member, points[near])) for member in state.members]
     result[near] = np.mean(members, axis=0)
     return result
 

@@ -178,6 +178,7 @@ def test_what_a_manifest_lacks_is_named(bundle, name):
         ("discrepancy", {"spread_mm": 0.6}, "a number for fidelity"),
         ("usual", {"misfit_mm": 0.6, "misfit_exponent": 0.1}, "surface_sd_mm, surface_sd_exponent"),
         ("posterior", {"sd_scale": None, "offset_mm": 0.1}, "sd_scale"),
+        ("posterior", {"sd_scale": 1.0, "offset_mm": 0.1, "sharpness": 0.0}, "sharpness"),
         ("typical", {"freedom": 9.0}, "rarity_mean"),
         ("typical", [1.0], "figures by name"),
         ("clusters", {"direction": [1.0, 0.0]}, "lack direction, shares, means, sd"),

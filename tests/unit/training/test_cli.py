@@ -312,6 +312,8 @@ class TestComplete:
         assert (told["completion_share"], told["spread_mm"]) == (share, manifest.discrepancy["spread_mm"])
         spreads = manifest.calibration["cross_entropy_by_spread"]
         assert float(min(spreads, key=spreads.__getitem__)) == manifest.discrepancy["spread_mm"]
+        factors = manifest.calibration["cross_entropy_by_sharpness"]
+        assert float(min(factors, key=factors.__getitem__)) == manifest.posterior["sharpness"]
         before = (folder / "manifest.json").read_bytes()
         assert run("calibrate", folder, "--masks", bundle.parent / "masks").exit_code == 0
         assert (folder / "manifest.json").read_bytes() == before

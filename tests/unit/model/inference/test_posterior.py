@@ -157,6 +157,13 @@ def test_mean_probability_laws(logit, variance):
     assert mean_probability(np.array([logit]), np.zeros(1))[0] == pytest.approx(expit(logit), abs=1e-12)
 
 
+@given(logit=st.floats(-80.0, 80.0), variance=st.floats(0.0, 1e3), sharpness=st.floats(0.5, 4.0))
+def test_sharpness_multiplies_the_logit(logit, variance, sharpness):
+    found = mean_probability(np.array([logit]), np.array([variance]), sharpness)
+    scaled = mean_probability(np.array([sharpness * logit]), np.array([sharpness**2 * variance]))
+    np.testing.assert_allclose(found, scaled, atol=1e-12)
+
+
 def test_displacement_follows_the_surface():
     """A point moved outwards by the displacement is on the surface of the moved shape again."""
     model = ellipsoid_model()
