@@ -20,8 +20,8 @@ from model.inference.mesh import Mesh, vertex_areas, volume_ml
 from model.inference.one_body import body_probability
 from model.inference.reconstruction import Options, Reconstruction, UncertaintyRule, reconstruct
 from model.inference.uncertainty import ShapeState, surface_spread
-from training.scored_drawing import near_surface
 from training.cohorts.cohort import Case
+from training.scored_drawing import near_surface
 from training.sparsify import Drawing, Regime, for_evaluation
 from training.surface_error import anti_aliased_points, distances_to, true_points
 
