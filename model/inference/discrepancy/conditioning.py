@@ -20,7 +20,7 @@ from model.inference.objective import Place
 from model.inference.observations import Observations
 from model.inference.posterior import model_logits
 from model.inference.surface import canonical_box
-from model.inference.thick_slices import along, columns_of
+from model.inference.thick_slices import Columns, columns_of, decided
 
 #: Points of a contour this close together (mm) are taken together.
 CELL_MM = 1.5
@@ -31,8 +31,6 @@ MOST_POINTS, CLOSEST_MM = 900, 0.3
 CLEARLY_WRONG_MM = 1.5
 #: Planes are kept this far apart (mm) when distances within them are looked up.
 APART_MM = 1e4
-#: Weight of the median level through a thick slice beside the level at its centre, in what its contours are told of.
-MEDIAN_SHARE = 0.5
 #: SD of the observations that no fidelity goes below (mm): half a voxel's quantisation.
 LEAST_NOISE_MM = 0.1
 
@@ -98,8 +96,8 @@ def discrepancy_of(
     """The discrepancy given the drawn contours; None where the model alone is trusted or nothing was drawn.
 
     Observed are contour points (the surface runs there) and observations far on the wrong side of the fitted surface
-    (it is elsewhere). On a thick slice that is told of a level half-way between the one at the slice's centre and the
-    median through its thickness. Planes that the fit left out are left out.
+    (it is elsewhere). On a thick slice that is told of the level that decides whether half of the thickness is filled
+    (`model.inference.thick_slices`). Planes that the fit left out are left out.
     """
     if prior.fidelity <= 0.0:
         return None
@@ -146,12 +144,12 @@ class _Evidence:
 
     Attributes:
         distances: signed, from the drawn contour (world mm, positive inside; 0 on it).
-        columns: the vector through the slice where that is thick (world mm; 0 elsewhere).
+        columns: what is averaged there.
     """
 
     points: Float[np.ndarray, "n 3"]
     distances: Float[np.ndarray, "n"]
-    columns: Float[np.ndarray, "n 3"]
+    columns: Columns
 
     def __getitem__(self, chosen: Int[np.ndarray, "m"] | Bool[np.ndarray, "n"]) -> "_Evidence":
         return _Evidence(self.points[chosen], self.distances[chosen], self.columns[chosen])
@@ -165,14 +163,15 @@ def _told_of(
     model: ShapeModel, found: Fit, levels: Levels, seen: _Evidence, at_centres: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
     """Distance from the fitted surface (mm) that is observed at each point: that there, on thin slices."""
-    thick = seen.columns.any(axis=1)
+    thick = seen.columns.counts > 0
     if not thick.any():
         return at_centres
-    places = along(seen.points[thick], seen.columns[thick])
-    world = places.reshape(-1, 3)
-    through = levels.at(model_logits(model, found, world), found.pose.to_canonical(world)).reshape(places.shape[:2])
+
+    def level(points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
+        return levels.at(model_logits(model, found, points), found.pose.to_canonical(points))
+
     result = at_centres.copy()
-    result[thick] += MEDIAN_SHARE * (np.median(through, axis=0) - result[thick])
+    _, result[thick] = decided(level, seen.points[thick], seen.columns[thick])
     return result
 
 
@@ -187,7 +186,7 @@ def _evidence(model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observ
     whole = _Evidence(
         np.concatenate([contour, observations.points[wrong]]),
         np.concatenate([np.zeros(len(contour)), distances]),
-        np.concatenate([columns[plane_of], columns[observations.plane_of[wrong]]]),
+        columns[np.concatenate([plane_of, observations.plane_of[wrong]])],
     )
     if not len(whole.points):
         return whole
@@ -196,7 +195,7 @@ def _evidence(model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observ
     means = _Evidence(
         means_of(cells, whole.points),
         means_of(cells, whole.distances[:, None])[:, 0],
-        means_of(cells, whole.columns),
+        Columns(means_of(cells, whole.columns.vectors), means_of(cells, whole.columns.widths_mm[:, None])[:, 0]),
     )
     return means[_spread_out(found.pose.to_canonical(means.points), means.distances != 0.0)]
 
