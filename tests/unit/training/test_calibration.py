@@ -2,12 +2,10 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from tests.analytic_model import ellipsoid_model
-from tests.analytic_shapes import Ellipsoid
-from tests.drawn_shapes import cube_around, rotation
+from tests.ellipsoid_cases import CASES as SHAPES
 from training.calibration import (
     CASES,
     FIDELITIES,
@@ -20,14 +18,7 @@ from training.calibration import (
     with_probability_scale,
     with_sound_drawings,
 )
-from training.cohorts.cohort import Case
 
-CENTRE = np.array([30.0, -20.0, 50.0])
-GRID = cube_around(CENTRE, nodes=37)
-SHAPES = [
-    Case(name, name, "validation", Ellipsoid(axes, CENTRE, rotation(10.0)).mask(GRID), GRID)
-    for name, axes in (("long", (14.5, 8.5, 7.5)), ("short", (11.5, 9.5, 7.0)))
-]
 MODEL = ellipsoid_model()
 
 

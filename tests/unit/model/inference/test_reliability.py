@@ -22,19 +22,11 @@ from model.inference.reliability import (
     unusual_warnings,
 )
 from tests.analytic_model import ellipsoid_model
-from tests.analytic_shapes import Ellipsoid
-from tests.drawn_shapes import cube_around, rotation
-from training.cohorts.cohort import Case
+from tests.ellipsoid_cases import CASES, GRID
 from training.perturb import cut_off, noisy, parallel, sections_of, with_wrong
 from training.sparsify import for_evaluation
 from training.usual import sound_answers, sound_drawings, usual_figures
 
-CENTRE = np.array([30.0, -20.0, 50.0])
-GRID = cube_around(CENTRE, nodes=37)
-CASES = [
-    Case(name, name, "validation", Ellipsoid(axes, CENTRE, rotation(10.0)).mask(GRID), GRID)
-    for name, axes in (("long", (14.5, 8.5, 7.5)), ("short", (11.5, 9.5, 7.0)))
-]
 PLAIN = ellipsoid_model()
 USUAL = usual_figures(sound_answers(PLAIN, CASES), len(CASES))
 MODEL = replace(PLAIN, manifest=replace(PLAIN.manifest, usual=USUAL))
