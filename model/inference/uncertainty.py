@@ -97,7 +97,7 @@ def calibrated_scale(model: ShapeModel) -> tuple[float, float]:
 
 
 def sharpness_of(model: ShapeModel) -> float:
-    """Factor on logits of a posterior before probabilities are taken of them.
+    """Factor on logits of a Laplace posterior before probabilities are taken of them.
 
     By themselves they are soft by what codes do not tell, and part of that doubt is the posterior's.
     """
@@ -183,12 +183,14 @@ def _logits(
 def _member_probabilities(
     model: ShapeModel, state: ShapeState, grid: Grid, index: Int[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Mean probability over an ensemble; far from the fit's surface all members agree with it."""
+    """Mean probability over an ensemble; far from the fit's surface all members agree with it.
+
+    Members' own logits are as soft as they are: what the discrepancy leaves open is not added to them.
+    """
     inside = model_logits(model, state.fits[0], points) > 0
     near = _near_border(inside, index, grid.spacing)
     result = inside.astype(float)
-    sharpness = sharpness_of(model)
-    members = [_sigmoid(sharpness * fitted_logits(model, member, points[near])) for member in state.members]
+    members = [_sigmoid(fitted_logits(model, member, points[near])) for member in state.members]
     result[near] = np.mean(members, axis=0)
     return result
 
