@@ -12,7 +12,7 @@ for the model (`training.usual`) and how wide its SDs have to be (`training.post
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from model.inference.discrepancy.conditioning import DiscrepancyPrior
 from model.inference.posterior import fitted_logits
 from model.inference.typicality import peak_density
 from model.inference.uncertainty import sharpness_of
-from training.cohorts.cohort import Case, Cohort
+from training.cohorts.cohort import Case, Cohort, evenly
 from training.config import Regime
 from training.evaluate import surface_distance
 from training.posterior_scale import posterior_scale
@@ -84,11 +84,6 @@ def calibrate(model: ShapeModel, cases: Sequence[Case], advance: Advance = lambd
     return Calibration({trust: float(np.mean(values)) for trust, values in totals.items()})
 
 
-def evenly(cases: Sequence[Case], count: int) -> Sequence[Case]:
-    """Evenly spaced cases, so many at most."""
-    return cases[:: -(-len(cases) // count)]
-
-
 def calibrate_bundle(
     folder: Path, cohort: Cohort, advance: Advance = lambda: None, *, threads: int | None = None
 ) -> Calibration:
@@ -131,9 +126,9 @@ def stages(manifest: Manifest) -> int:
     return len(PRECISIONS) + (len(SHARES) if manifest.completion else 0) + 2
 
 
-def changed(model: ShapeModel, **values: object) -> ShapeModel:
-    """The model with other values in its manifest."""
-    return replace(model, manifest=replace(model.manifest, **values))  # type: ignore[arg-type]
+def changed(model: ShapeModel, **values: Any) -> ShapeModel:
+    """The model with other values in its manifest, by the names of `Manifest`."""
+    return replace(model, manifest=replace(model.manifest, **values))
 
 
 def counting(model: ShapeModel, share: float) -> ShapeModel:

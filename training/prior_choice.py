@@ -17,7 +17,7 @@ from jaxtyping import Float
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
 from training.calibration import PRECISIONS, Advance, with_precision
-from training.cohorts.cohort import Case, listed
+from training.cohorts.cohort import Case, evenly, listed
 from training.config import Regime
 from training.evaluate import surface_distance
 from training.pruning import PriorParts
@@ -74,7 +74,7 @@ def chosen_parts(
         InvalidParameter: the run is not finished, or was trained on one of the cases.
     """
     _check_unseen(run, cases)
-    used = cases[:: -(-len(cases) // CASES)]
+    used = evenly(cases, CASES)
 
     def errors(model: ShapeModel, precision: float) -> Float[np.ndarray, "n"]:
         found = _errors(model, precision, used, regimes)

@@ -12,7 +12,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from model.errors import InvalidParameter
 from training.autodecoder import CHECKPOINT, AutoDecoder, Trainer, Watch, is_ended, train
-from training.cohorts.cohort import Case, Cohort
+from training.cohorts.cohort import Case, Cohort, evenly
 from training.config import TrainingConfig, config_from_dict
 from training.difference import first_difference
 from training.points import cohort_points, decoder_extent
@@ -195,7 +195,7 @@ def _validating_watch(
     config = trainer.config
     if not cohort.validation:
         return watch
-    chosen = cohort.validation[:: -(-len(cohort.validation) // VALIDATED)]
+    chosen = evenly(cohort.validation, VALIDATED)
     validation = Validation(config, cohort_points(chosen, "dense", config.seed, torch.get_num_threads()))
 
     def validate(step: int, figures: dict[str, float]) -> None:

@@ -150,6 +150,11 @@ def hold_out(cases: Sequence[Case], *, fraction: float, seed: int, split: Split 
     )
 
 
+def evenly(cases: Sequence[Case], count: int) -> Sequence[Case]:
+    """Evenly spaced cases, so many at most."""
+    return cases[:: -(-len(cases) // count)]
+
+
 def divided_persons(cases: Iterable[Case]) -> tuple[str, ...]:
     """Persons who stand in more than one split."""
     splits: dict[str, set[str]] = {}

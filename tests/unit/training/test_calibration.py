@@ -14,10 +14,10 @@ from training.calibration import (
     Trust,
     calibrate,
     changed,
-    evenly,
     with_probability_scale,
     with_sound_drawings,
 )
+from training.cohorts.cohort import evenly
 
 MODEL = ellipsoid_model()
 
