@@ -213,6 +213,7 @@ class _Run:
         while waiting:
             first = waiting.popleft()
             self._await_end(first.workflow_id)
+            self._require_known()
             with self._busy.one():
                 answers.append(_answer(first))
                 self._done += counts[len(answers) - 1]
@@ -236,6 +237,12 @@ class _Run:
             return self._jobs.is_wanted(part)
         except Overloaded:  # the database is away; the next look may find it
             return True
+
+    def _require_known(self) -> None:
+        """A job that was deleted has no answers any more; one would be waited for without end."""
+        with suppress(Overloaded):  # a database that is away does not say that it was deleted
+            if not self._jobs.known([self._id]):
+                raise Cancelled("The job was deleted.")
 
     def _report(self) -> None:
         DBOS.set_event(PROGRESS, {"done": self._done, "total": self._total, "started_ms": self._started_ms})

@@ -116,6 +116,11 @@ def test_cancelling_stops_what_runs_and_what_waits(url):
     jobs.close()
 
 
+def followers():
+    """Threads that follow jobs; those without one end with their worker."""
+    return [thread for thread in threading.enumerate() if thread.name.startswith("dbos-executor")]
+
+
 def test_a_part_that_ends_after_its_job_was_deleted_leaves_nothing(url):
     entered, deleted, forgotten = threading.Event(), threading.Event(), []
 
@@ -136,6 +141,9 @@ def test_a_part_that_ends_after_its_job_was_deleted_leaves_nothing(url):
         jobs.enqueue("late", {}, other)
         assert awaited(jobs, other).state is JobState.DONE
     assert forgotten == [identifier]
+    for thread in followers():
+        thread.join(10.0)
+        assert not thread.is_alive()
     assert jobs.known([identifier, other]) == {other}
     jobs.close()
 
