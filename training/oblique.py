@@ -1,4 +1,4 @@
-"""Drawings on random planes of any orientation, cut out of dense masks.
+"""Drawings in stacks of any orientation: on random planes cut out of dense masks.
 
 Each plane is a stack of its own: one slice of (a, b, 1) voxels at the mask's finest spacing, with its own affine.
 Normals are uniform on the sphere, offsets uniform over the object's extent along the normal; planes that miss the
@@ -15,6 +15,7 @@ from scipy.ndimage import map_coordinates
 from model.geometry import Grid
 from model.inference.observations import MaskStack, Plane
 from training.cohorts.cohort import Case
+from training.sparsify import Drawing
 
 #: Least area (mm^2) of a section that counts as holding the object.
 LEAST_AREA_MM2 = 4.0
@@ -28,6 +29,11 @@ class SliceStacks:
 
     stacks: tuple[MaskStack, ...]
     planes: tuple[Plane, ...]
+
+
+def alone(drawing: Drawing) -> SliceStacks:
+    """A drawing in one stack."""
+    return SliceStacks((drawing.stack,), drawing.planes)
 
 
 def random_planes(case: Case, count: int, seed: int = 0) -> SliceStacks:

@@ -13,8 +13,7 @@ from model.inference.observations import Observations, observe
 from model.inference.reconstruction import COVER_SHARE_OF_BAND, OBSERVATION_BUDGET
 from model.inference.thick_slices import through_thickness
 from training.cohorts.cohort import Case
-from training.config import Regime
-from training.sparsify import Drawing, for_evaluation
+from training.oblique import SliceStacks
 
 #: Voxels this close to the true surface are scored (mm), at most so many of a case.
 BAND_MM = 5.0
@@ -25,7 +24,7 @@ SCORED_VOXELS = 4000
 class ScoredDrawing:
     """A fit to one drawing of a case with its discrepancy, and voxels (world mm) near the true surface with labels."""
 
-    drawing: Drawing
+    drawing: SliceStacks
     observations: Observations
     found: Fit
     points: Float[np.ndarray, "n 3"]
@@ -33,19 +32,17 @@ class ScoredDrawing:
 
     def corrected(self, model: ShapeModel, prior: DiscrepancyPrior) -> Fit:
         """The fit with its discrepancy under another prior."""
-        return corrected(model, self.found, [self.drawing.stack], self.observations, prior)
+        return corrected(model, self.found, self.drawing.stacks, self.observations, prior)
 
 
-def scored_drawing(model: ShapeModel, case: Case, regime: Regime) -> ScoredDrawing:
-    """A case drawn in a regime and fitted at the model's likelihood precision."""
-    drawing = for_evaluation(case.mask, case.grid, regime)
-    observations = observe(
-        [drawing.stack], drawing.planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=0
-    )
+def scored_drawing(model: ShapeModel, case: Case, drawing: SliceStacks) -> ScoredDrawing:
+    """A drawing of a case, fitted at the model's likelihood precision."""
+    stacks = drawing.stacks
+    observations = observe(stacks, drawing.planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=0)
     options = FitOptions(robust=False)
     fitted = fit(model, observations, options)
-    found, _ = through_thickness(model, fitted, [drawing.stack], observations, options)
-    found = with_discrepancy(model, found, [drawing.stack], observations, DiscrepancyPrior())
+    found, _ = through_thickness(model, fitted, stacks, observations, options)
+    found = with_discrepancy(model, found, stacks, observations, DiscrepancyPrior())
     index = np.argwhere(near_surface(case.mask, case.grid.spacing))
     index = index[:: -(-len(index) // SCORED_VOXELS)]
     points, truth = case.grid.to_world(index.astype(float)), case.mask[tuple(index.T)]
