@@ -3,12 +3,10 @@
 Neighbouring voxels are not independent, so the sum of their log likelihoods overstates what a slice tells (likelihood
 precision), and what the code leaves unexplained at a contour is partly the shape's, partly the annotator's (fidelity of
 the discrepancy). Both are those that leave the fewest voxels near the true surface on its wrong side, the lowest of
-those that hardly differ. Drawings on few planes count among the others: too high a precision hardly shows where slices
-are many; where they are few, the fit follows them to shapes that no anatomy has. Of models that have a network to
-complete drawings, the weight of what it says is chosen by the average surface distance after that. With these, how far
-the discrepancy spreads and how sharp logits are (`training.probability_scale`) make probabilities right, and answers to
-sound drawings tell what is usual and typical for the model (`training.usual`) and how wide its SDs have to be
-(`training.posterior_scale`).
+those that hardly differ. Of models that have a network to complete drawings, the weight of what it says is chosen by
+the average surface distance after that. With these, how far the discrepancy spreads and how sharp logits are
+(`training.probability_scale`) make probabilities right, and answers to sound drawings tell what is usual and typical
+for the model (`training.usual`) and how wide its SDs have to be (`training.posterior_scale`).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +24,7 @@ from model.inference.uncertainty import sharpness_of
 from training.cohorts.cohort import Case, Cohort, evenly
 from training.config import Regime
 from training.evaluate import surface_distance
-from training.oblique import SliceStacks, alone, random_planes
+from training.oblique import SliceStacks, alone
 from training.posterior_scale import posterior_scale
 from training.probability_scale import as_facts, best_scale, cross_entropies
 from training.scored_drawing import scored_drawing
@@ -34,13 +32,12 @@ from training.seen import check_unseen
 from training.sparsify import for_evaluation
 from training.usual import sound_answers, typical_figures, usual_figures
 
-#: Precisions that are tried (1/mm^2), fidelities, and what they are tried on: regimes, and numbers of random planes.
+#: Precisions that are tried (1/mm^2), fidelities, and the regimes that they are tried on.
 PRECISIONS = (0.1, 0.2, 0.4, 0.8)
 FIDELITIES = (0.15, 0.3, 0.5, 0.7, 0.85)
 #: Weights of a completed drawing beside the fitted surface that are tried, and the one before any was chosen.
 SHARES, UNCALIBRATED_SHARE = (0.0, 0.25, 0.5, 0.75), 0.5
 REGIMES: tuple[Regime, ...] = ("orthogonal", "thin", "thick")
-FEW_PLANES = (2, 3)
 #: Errors that differ by less than this share count as equal: the least precision then gives the quickest fit.
 TIE = 0.005
 #: Evenly spaced validation cases by which precision and fidelity are chosen, those by which the weight of completed
@@ -90,8 +87,8 @@ def calibrate(model: ShapeModel, cases: Sequence[Case], advance: Advance = lambd
 
 
 def drawings_of(case: Case) -> list[SliceStacks]:
-    """The drawings of a case that precision and fidelity are chosen by."""
-    return [*_in_regimes(case), *(random_planes(case, count) for count in FEW_PLANES)]
+    """The drawings of a case that a model is calibrated on."""
+    return [alone(for_evaluation(case.mask, case.grid, regime)) for regime in REGIMES]
 
 
 def calibrate_bundle(
@@ -113,7 +110,6 @@ def calibrate_bundle(
         "split": "validation",
         "cases": [case.name for case in evenly(cohort.validation, CASES)],
         "regimes": list(REGIMES),
-        "few_planes": list(FEW_PLANES),
         "error_by_precision_and_fidelity": found.as_facts(),
     }
     # What was measured before does not hold any more.
@@ -170,7 +166,7 @@ def with_share(model: ShapeModel, cases: Sequence[Case], advance: Advance = lamb
 def with_probability_scale(model: ShapeModel, cases: Sequence[Case]) -> ShapeModel:
     """The model with the spread of its discrepancy and the sharpness that make probabilities right, all else given."""
     chosen = evenly(cases, WEIGHED_CASES)
-    drawings = (scored_drawing(model, case, drawing) for case in chosen for drawing in _in_regimes(case))
+    drawings = (scored_drawing(model, case, drawing) for case in chosen for drawing in drawings_of(case))
     found = cross_entropies(model, drawings)
     best = best_scale(found)
     return changed(
@@ -221,10 +217,6 @@ def with_sound_drawings(model: ShapeModel, cases: Sequence[Case], advance: Advan
 def with_precision(model: ShapeModel, precision: float) -> ShapeModel:
     """The model with another likelihood precision (1/mm^2)."""
     return changed(model, likelihood_precision=precision)
-
-
-def _in_regimes(case: Case) -> list[SliceStacks]:
-    return [alone(for_evaluation(case.mask, case.grid, regime)) for regime in REGIMES]
 
 
 def _errors(model: ShapeModel, case: Case, drawn: SliceStacks) -> Iterator[tuple[Trust, float]]:

@@ -8,15 +8,12 @@ from tests.analytic_model import ellipsoid_model
 from tests.ellipsoid_cases import CASES as SHAPES
 from training.calibration import (
     CASES,
-    FEW_PLANES,
     FIDELITIES,
     PRECISIONS,
-    REGIMES,
     Calibration,
     Trust,
     calibrate,
     changed,
-    drawings_of,
     with_probability_scale,
     with_sound_drawings,
 )
@@ -45,12 +42,6 @@ def test_all_pairs_are_tried():
 @pytest.mark.parametrize(("count", "used"), [(1, 1), (8, 8), (9, 5), (36, 8)])
 def test_cases_are_spaced_evenly(count, used):
     assert len(evenly(SHAPES[:1] * count, CASES)) == used
-
-
-def test_drawings_on_few_planes_count_among_the_others():
-    drawings = drawings_of(SHAPES[0])
-    assert [len(drawing.planes) for drawing in drawings[-len(FEW_PLANES) :]] == list(FEW_PLANES)
-    assert len(drawings) == len(REGIMES) + len(FEW_PLANES)
 
 
 def test_the_scale_of_probabilities_survives_the_width_of_sds():
