@@ -24,6 +24,7 @@ from model.inference.reliability import MOST_USUAL_PLANES, USUAL_PLANES, Figures
 from model.inference.typicality import rarity
 from model.inference.uncertainty import surface_spread
 from training.cohorts.cohort import Case
+from training.field_of_view import in_view, volume_out_of_view_ml
 from training.perturb import Sections, parallel, sections_of
 from training.sparsify import for_evaluation
 from training.surface_error import digitisation_mm, distances_to, true_points
@@ -123,15 +124,16 @@ def answered(model: ShapeModel, case: Case, drawing: Sections) -> Sound:
     sections = compared(observations, fitted_logits(model, found, observations.points), found.plane_weights)
     spread, sd = surface_spread(model, answer.state, mesh), mesh.scalars[SURFACE_SD]
     swelling = vertex_areas(mesh) / 1000.0
-    errors = np.square(distances_to(true_points(case.mask, case.grid), mesh.vertices)).mean()
+    seen = in_view(case.mask, case.grid, mesh.vertices)
+    errors = np.square(distances_to(true_points(case.mask, case.grid), mesh.vertices[seen])).mean()
     truth = float(case.mask.sum() * np.prod(case.grid.spacing)) / 1000.0
     return Sound(
         figures=figures,
         density=answer.log_prior_density,
         surprises=tuple(section.surprise for section in sections),
         surface_error_mm=float(np.sqrt(max(errors - digitisation_mm(case.grid) ** 2, 0.0))),
-        surface_sd_mm=float(np.sqrt(np.square(sd).mean())),
-        volume_error_ml=volume_ml(mesh) - truth,
+        surface_sd_mm=float(np.sqrt(np.square(sd[seen]).mean())),
+        volume_error_ml=volume_ml(mesh) - volume_out_of_view_ml(case.mask, case.grid, mesh) - truth,
         volume_sd_ml=0.0 if spread is None else spread.sd_of(swelling),
         swelling_ml=float(swelling.sum()),
     )

@@ -21,6 +21,7 @@ from model.inference.one_body import body_probability
 from model.inference.reconstruction import Options, Reconstruction, UncertaintyRule, reconstruct
 from model.inference.uncertainty import ShapeState, surface_spread
 from training.cohorts.cohort import Case
+from training.field_of_view import in_view, volume_out_of_view_ml
 from training.scored_drawing import near_surface
 from training.sparsify import Drawing, Regime, for_evaluation
 from training.surface_error import anti_aliased_points, distances_to, true_points
@@ -38,14 +39,14 @@ def measure_answer(model: ShapeModel, case: Case, regime: Regime) -> Payload:
     drawing = for_evaluation(case.mask, case.grid, regime)
     plain, laplace, ensemble = (_timed(model, drawing, rule) for rule in ("none", "laplace", "ensemble"))
     answer = laplace[0]
-    points = true_points(case.mask, case.grid)
-    errors = distances_to(points, answer.mesh.vertices)
-    smooth = distances_to(anti_aliased_points(case.mask, case.grid), answer.mesh.vertices)
+    seen = _part_in_view(answer.mesh, case)
+    errors = distances_to(true_points(case.mask, case.grid), seen.vertices)
+    smooth = distances_to(anti_aliased_points(case.mask, case.grid), seen.vertices)
     return {
         "volume": _volume(model, answer, case),
         "ensemble_volume": _volume(model, ensemble[0], case),
         "voxels": {"laplace": _voxels(model, answer, case), "ensemble": _voxels(model, ensemble[0], case)},
-        "vertices": _vertices(model, answer.mesh, answer.state, ensemble[0].state, errors, smooth),
+        "vertices": _vertices(model, seen, answer.state, ensemble[0].state, errors, smooth),
         "seconds": {
             "fit": laplace[1]["fit"],
             "laplace": laplace[1]["uncertainty"] - plain[1]["uncertainty"],
@@ -54,6 +55,12 @@ def measure_answer(model: ShapeModel, case: Case, regime: Regime) -> Payload:
         "typicality_percentile": answer.typicality_percentile,
         "warnings": list(answer.warnings),
     }
+
+
+def _part_in_view(mesh: Mesh, case: Case) -> Mesh:
+    """The vertices that the mask can judge, without faces."""
+    seen = in_view(case.mask, case.grid, mesh.vertices)
+    return replace(mesh, vertices=mesh.vertices[seen], normals=mesh.normals[seen], faces=mesh.faces[:0], scalars={})
 
 
 def _timed(model: ShapeModel, drawing: Drawing, rule: UncertaintyRule) -> tuple[Reconstruction, dict[str, float]]:
@@ -69,6 +76,7 @@ def _timed(model: ShapeModel, drawing: Drawing, rule: UncertaintyRule) -> tuple[
 def _volume(model: ShapeModel, answer: Reconstruction, case: Case) -> Payload:
     slope, spread = vertex_areas(answer.mesh) / 1000.0, surface_spread(model, answer.state, answer.mesh)
     truth = float(case.mask.sum() * np.prod(case.grid.spacing)) / 1000.0
+    truth += volume_out_of_view_ml(case.mask, case.grid, answer.mesh)
     value = volume_ml(answer.mesh)
     held = {}
     for level in LEVELS:
@@ -100,7 +108,7 @@ def _vertices(
     smooth: Float[np.ndarray, "v"],
 ) -> Payload:
     step = max(1, len(errors) // KEPT_VERTICES)
-    few = replace(mesh, vertices=mesh.vertices[::step], normals=mesh.normals[::step], faces=mesh.faces[:0], scalars={})
+    few = replace(mesh, vertices=mesh.vertices[::step], normals=mesh.normals[::step])
     found = {"error_mm": errors[::step].round(4).tolist(), "smooth_error_mm": smooth[::step].round(4).tolist()}
     for name, state in (("laplace", laplace), ("ensemble", ensemble)):
         spread = surface_spread(model, state, few)

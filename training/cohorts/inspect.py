@@ -70,6 +70,11 @@ def findings_of(mask: Bool[np.ndarray, "i j k"]) -> tuple[str, ...]:
     return tuple(sentence for sentence in found if sentence)
 
 
+def cut_faces(mask: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "2 3"]:
+    """Which faces of the crop the object reaches: the first voxels along each axis, and the last ones."""
+    return np.array([[mask.take(index, axis=axis).any() for axis in range(3)] for index in (0, -1)])
+
+
 def touches_border(mask: Bool[np.ndarray, "i j k"]) -> bool:
     """Whether the object reaches the first or the last voxel along any axis of the crop."""
     return _borders(mask) != ""
@@ -88,7 +93,7 @@ def _large_parts(mask: Bool[np.ndarray, "i j k"]) -> str:
 
 
 def _borders(mask: Bool[np.ndarray, "i j k"]) -> str:
-    faces = sum(bool(mask.take(index, axis=axis).any()) for axis in range(3) for index in (0, -1))
+    faces = int(cut_faces(mask).sum())
     return f"the object touches {faces} face(s) of the crop and may be cut off" if faces else ""
 
 
