@@ -1,7 +1,6 @@
 """The commands ``jobs ...``: long work from the command line, by the same engine and with the same progress."""
 
 import time
-import zipfile
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -175,8 +174,8 @@ def _finish(jobs: JobEngine, blobs: BlobStore, status: JobStatus, output: Path |
             status = jobs.status(status.id)
             advance(status.kind, status.done, status.total)
     if status.state is JobState.DONE and output is not None and status.result is not None:
-        with writing("--output"), zipfile.ZipFile(output, "w") as archive:
-            write_zip(archive, JobFiles(blobs, status.id), status.kind, status.result["count"])
+        with writing("--output"):
+            write_zip(output, JobFiles(blobs, status.id), status.kind, status.result["count"])
     _tell(status, as_json=as_json)
     if status.state is not JobState.DONE:
         raise NotReady(status.problem or f"The job has no result: it is {status.state.value}.")

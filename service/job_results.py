@@ -4,6 +4,7 @@ import json
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from model.inference.plausibility import counted
@@ -53,7 +54,13 @@ def counts_of(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def write_zip(archive: zipfile.ZipFile, job: JobFiles, kind: str, count: int) -> None:
-    """All of it into an open archive."""
-    for name, data in result_members(job, kind, count):
-        archive.writestr(name, data)
+def write_zip(target: Path, job: JobFiles, kind: str, count: int) -> None:
+    """All of it in a file; none is left where it cannot be read to its end."""
+    try:
+        with zipfile.ZipFile(target, "w") as archive:
+            for name, data in result_members(job, kind, count):
+                archive.writestr(name, data)
+    except BaseException:
+        if target.is_file():
+            target.unlink()
+        raise

@@ -1,6 +1,5 @@
 """What a job has made is read whole, or told to be gone or away."""
 
-import io
 import json
 import zipfile
 
@@ -38,9 +37,8 @@ def made(folder):
 
 
 def test_items_come_in_order_and_the_manifest_last(tmp_path):
-    target, job = io.BytesIO(), made(tmp_path)
-    with zipfile.ZipFile(target, "w") as archive:
-        write_zip(archive, job, RECONSTRUCTIONS_JOB, 2)
+    target, job = tmp_path / "all.zip", made(tmp_path)
+    write_zip(target, job, RECONSTRUCTIONS_JOB, 2)
     with zipfile.ZipFile(target) as archive:
         assert archive.namelist() == ["0.stl", "1.stl", MANIFEST]
         manifest = json.loads(archive.read(MANIFEST))
@@ -60,3 +58,12 @@ def test_what_the_storage_does_not_give_is_for_later(tmp_path, left):
     made(tmp_path)
     with pytest.raises(Overloaded):
         list(result_members(JobFiles(AwayBlobs(tmp_path, left), JOB), RECONSTRUCTIONS_JOB, 2))
+
+
+@pytest.mark.parametrize("left", range(5))
+def test_no_file_is_left_half_written(tmp_path, left):
+    made(tmp_path)
+    target = tmp_path / "all.zip"
+    with pytest.raises(Overloaded):
+        write_zip(target, JobFiles(AwayBlobs(tmp_path, left), JOB), RECONSTRUCTIONS_JOB, 2)
+    assert not target.exists()
