@@ -12,7 +12,6 @@ import pytest
 from playwright.sync_api import expect
 
 from benchmarks.browser import drag_ellipse
-from benchmarks.server import serving
 from service.app import create_app
 from service.settings import Settings
 from tests.dicom_parts import file_bytes, mr_series, seg_of
@@ -20,7 +19,6 @@ from tests.page_parts import (
     PHONE,
     drop,
     overflow,
-    patient_browser,
     picture,
     reconstruct,
     serious,
@@ -32,18 +30,6 @@ from tests.service_parts import behind_prefix, running
 pytestmark = pytest.mark.slow
 UP, DOWN, LEFT, RIGHT = (f"Shift+Arrow{way}" for way in ("Up", "Down", "Left", "Right"))
 EXAMPLE = "docs/examples/hippocampus_three_slices.nii.gz"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with patient_browser() as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def address(shipped_bundles, browser):  # noqa: ARG001 - no service where nobody can visit it
-    with serving(()) as server:
-        yield str(server.client.base_url)
 
 
 @pytest.fixture

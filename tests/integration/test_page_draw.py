@@ -9,25 +9,12 @@ import pytest
 from playwright.sync_api import expect
 
 from benchmarks.browser import drag_ellipse
-from benchmarks.server import serving
-from tests.page_parts import patient_browser, visiting
+from tests.page_parts import visiting
 
 pytestmark = pytest.mark.slow
 #: Half axes of contours that fit each other, as shares of the canvas.
 AXES = {"axial": (0.12, 0.3), "sagittal": (0.3, 0.1), "coronal": (0.12, 0.1)}
 NOT_LOOKED_AT = 255
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with patient_browser() as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def address(shipped_bundles, browser):  # noqa: ARG001 - no service where nobody can visit it
-    with serving(()) as server:
-        yield str(server.client.base_url)
 
 
 @pytest.fixture

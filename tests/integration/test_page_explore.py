@@ -5,23 +5,10 @@ import re
 import pytest
 from playwright.sync_api import expect
 
-from benchmarks.server import serving
-from tests.page_parts import patient_browser, visiting
+from tests.page_parts import visiting
 
 pytestmark = pytest.mark.slow
 MISSING = "status of 404"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with patient_browser() as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def address(shipped_bundles, browser):  # noqa: ARG001 - no service where nobody can visit it
-    with serving(()) as server:
-        yield str(server.client.base_url)
 
 
 def modes(visit):

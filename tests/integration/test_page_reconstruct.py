@@ -10,26 +10,13 @@ import pytest
 from playwright.sync_api import expect
 
 from benchmarks.browser import drag_ellipse
-from benchmarks.server import serving
 from model.inference.typicality import ATYPICAL_PERCENTILE
-from tests.page_parts import drop, patient_browser, reconstruct, take_example, visiting
+from tests.page_parts import drop, reconstruct, take_example, visiting
 
 pytestmark = pytest.mark.slow
 EXAMPLE = "docs/examples/hippocampus_three_slices.nii.gz"
 #: Voxels (0.5 mm) of the half axes of an ellipsoid of the size of a talus.
 HALF_AXES = (50, 36, 34)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with patient_browser() as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def address(shipped_bundles, browser):  # noqa: ARG001 - no service where nobody can visit it
-    with serving(()) as server:
-        yield str(server.client.base_url)
 
 
 @pytest.fixture
