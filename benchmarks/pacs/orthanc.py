@@ -36,6 +36,9 @@ BY_DIMSE = (
 )
 BY_DICOMWEB = """RestApiPost('/dicom-web/servers/morphoflow/stow', '{"Resources":["' .. id .. '"]}', false)"""
 
+#: Orthanc closes a connection that was idle for a second, maybe just when the next request goes out on it.
+ONE_REQUEST_EACH = httpx.Limits(max_keepalive_connections=0)
+
 
 @dataclass(frozen=True)
 class Orthanc:
@@ -100,7 +103,8 @@ def running_orthanc(
         command = [shutil.which("Orthanc") or "Orthanc", str(settings)]
         process = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, **PROMPT})
     try:
-        with httpx.Client(base_url=f"http://127.0.0.1:{ports[0]}", timeout=60.0) as client:
+        address = f"http://127.0.0.1:{ports[0]}"
+        with httpx.Client(base_url=address, timeout=60.0, limits=ONE_REQUEST_EACH) as client:
             _wait_until_ready(client, process)
             yield Orthanc(client, *ports)
     finally:
