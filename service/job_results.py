@@ -55,12 +55,13 @@ def counts_of(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def write_zip(target: Path, job: JobFiles, kind: str, count: int) -> None:
-    """All of it in a file; none is left where it cannot be read to its end."""
-    try:
-        with zipfile.ZipFile(target, "w") as archive:
-            for name, data in result_members(job, kind, count):
-                archive.writestr(name, data)
-    except BaseException:
-        if target.is_file():
-            target.unlink()
-        raise
+    """All of it in a file; none is left half written, and one that cannot be opened stays as it is."""
+    with target.open("wb") as file:
+        try:
+            with zipfile.ZipFile(file, "w") as archive:
+                for name, data in result_members(job, kind, count):
+                    archive.writestr(name, data)
+        except BaseException:
+            if target.is_file():
+                target.unlink()
+            raise

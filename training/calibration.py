@@ -24,7 +24,7 @@ from model.inference.uncertainty import sharpness_of
 from training.cohorts.cohort import Case, Cohort, evenly
 from training.config import Regime
 from training.evaluate import surface_distance
-from training.oblique import SliceStacks, alone
+from training.oblique import SliceStacks, in_one_stack
 from training.posterior_scale import posterior_scale
 from training.probability_scale import as_facts, best_scale, cross_entropies
 from training.scored_drawing import scored_drawing
@@ -88,7 +88,7 @@ def calibrate(model: ShapeModel, cases: Sequence[Case], advance: Advance = lambd
 
 def drawings_of(case: Case) -> list[SliceStacks]:
     """The drawings of a case that a model is calibrated on."""
-    return [alone(for_evaluation(case.mask, case.grid, regime)) for regime in REGIMES]
+    return [in_one_stack(for_evaluation(case.mask, case.grid, regime)) for regime in REGIMES]
 
 
 def calibrate_bundle(

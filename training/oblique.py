@@ -31,7 +31,7 @@ class SliceStacks:
     planes: tuple[Plane, ...]
 
 
-def alone(drawing: Drawing) -> SliceStacks:
+def in_one_stack(drawing: Drawing) -> SliceStacks:
     """A drawing in one stack."""
     return SliceStacks((drawing.stack,), drawing.planes)
 

@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 
 from model.geometry import Grid
 from training.cohorts.cohort import Case
-from training.cohorts.inspect import bounding_box, touches_border
+from training.cohorts.inspect import bounding_box, cut_faces, touches_border
 from training.samples import ShapePoints
 from training.sparsify import Drawing, Regime, for_training
 
@@ -57,10 +57,10 @@ def window(case: Case, margin_mm: float = MARGIN_MM, *, cut_is_end: bool = False
     widths = [(int(width), int(width)) for width in pad]
     mask = np.pad(case.mask[box], widths)
     unknown = np.zeros(mask.shape, bool)
-    for axis, side in enumerate(box):
+    for axis, (first, last) in enumerate(cut_faces(case.mask).T & (not cut_is_end)):
         along = np.moveaxis(unknown, axis, 0)
-        along[: pad[axis]] |= not cut_is_end and side.start == 0
-        along[len(along) - pad[axis] :] |= not cut_is_end and side.stop == case.mask.shape[axis]
+        along[: pad[axis]] |= first
+        along[len(along) - pad[axis] :] |= last
     affine = case.grid.affine.astype(float).copy()
     affine[:3, 3] = case.grid.to_world(np.array([[side.start for side in box] - pad], float))[0]
     return Window(mask, Grid((mask.shape[0], mask.shape[1], mask.shape[2]), affine), unknown)

@@ -109,7 +109,7 @@ def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
         "train": {case.name: mask_digest(case) for case in cohort.train},
         "voxel_digests": [short_digest(case) for case in cohort.train],
         "codes": copies * len(cohort.train),
-        "volumes_ml": copies * [float(case.mask.sum() * np.prod(case.grid.spacing) / 1000.0) for case in cohort.train],
+        "volumes_ml": copies * [case.volume_ml for case in cohort.train],
         "half_extent_mm": half_extent(cohort),
         "validation": [case.name for case in cohort.validation],
         "refused": {refusal.name: refusal.reason for refusal in cohort.refused},

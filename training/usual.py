@@ -124,16 +124,15 @@ def answered(model: ShapeModel, case: Case, drawing: Sections) -> Sound:
     sections = compared(observations, fitted_logits(model, found, observations.points), found.plane_weights)
     spread, sd = surface_spread(model, answer.state, mesh), mesh.scalars[SURFACE_SD]
     swelling = vertex_areas(mesh) / 1000.0
-    seen = in_view(case.mask, case.grid, mesh.vertices)
+    seen = in_view(case, mesh.vertices)
     errors = np.square(distances_to(true_points(case.mask, case.grid), mesh.vertices[seen])).mean()
-    truth = float(case.mask.sum() * np.prod(case.grid.spacing)) / 1000.0
     return Sound(
         figures=figures,
         density=answer.log_prior_density,
         surprises=tuple(section.surprise for section in sections),
         surface_error_mm=float(np.sqrt(max(errors - digitisation_mm(case.grid) ** 2, 0.0))),
         surface_sd_mm=float(np.sqrt(np.square(sd[seen]).mean())),
-        volume_error_ml=volume_ml(mesh) - volume_out_of_view_ml(case.mask, case.grid, mesh) - truth,
+        volume_error_ml=volume_ml(mesh) - volume_out_of_view_ml(case, mesh) - case.volume_ml,
         volume_sd_ml=0.0 if spread is None else spread.sd_of(swelling),
         swelling_ml=float(swelling.sum()),
     )

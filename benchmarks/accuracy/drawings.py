@@ -3,7 +3,7 @@
 from enum import StrEnum
 
 from training.cohorts.cohort import Case
-from training.oblique import SliceStacks, alone, random_planes
+from training.oblique import SliceStacks, in_one_stack, random_planes
 from training.sparsify import REGIMES, for_evaluation
 
 
@@ -35,4 +35,4 @@ def draw(case: Case, name: DrawingName) -> SliceStacks:
     if name.random:
         return random_planes(case, int(name.value.removeprefix("planes-")))
     (regime,) = [regime for regime in REGIMES if regime == name.value]
-    return alone(for_evaluation(case.mask, case.grid, regime))
+    return in_one_stack(for_evaluation(case.mask, case.grid, regime))

@@ -59,7 +59,7 @@ def measure_answer(model: ShapeModel, case: Case, regime: Regime) -> Payload:
 
 def _part_in_view(mesh: Mesh, case: Case) -> Mesh:
     """The vertices that the mask can judge, without faces."""
-    seen = in_view(case.mask, case.grid, mesh.vertices)
+    seen = in_view(case, mesh.vertices)
     return replace(mesh, vertices=mesh.vertices[seen], normals=mesh.normals[seen], faces=mesh.faces[:0], scalars={})
 
 
@@ -75,8 +75,7 @@ def _timed(model: ShapeModel, drawing: Drawing, rule: UncertaintyRule) -> tuple[
 
 def _volume(model: ShapeModel, answer: Reconstruction, case: Case) -> Payload:
     slope, spread = vertex_areas(answer.mesh) / 1000.0, surface_spread(model, answer.state, answer.mesh)
-    truth = float(case.mask.sum() * np.prod(case.grid.spacing)) / 1000.0
-    truth += volume_out_of_view_ml(case.mask, case.grid, answer.mesh)
+    truth = case.volume_ml + volume_out_of_view_ml(case, answer.mesh)
     value = volume_ml(answer.mesh)
     held = {}
     for level in LEVELS:

@@ -18,7 +18,7 @@ from training.baselines.distance_modes import DistanceModes
 from training.baselines.kept_modes import ChosenModes, is_kept, write_chosen
 from training.cohorts.cohort import Case, Cohort
 from training.metrics_masks import agreement
-from training.oblique import SliceStacks, alone, random_planes
+from training.oblique import SliceStacks, in_one_stack, random_planes
 from training.sparsify import for_evaluation
 
 T = TypeVar("T")
@@ -65,7 +65,7 @@ def score(modes: DistanceModes, settings: FitSettings, drawn: Sequence[tuple[Cas
 def drawings_of(case: Case) -> list[SliceStacks]:
     """Thin and orthogonal slices, and five random planes."""
     parallel, crossed = (for_evaluation(case.mask, case.grid, regime) for regime in ("thin", "orthogonal"))
-    return [alone(parallel), alone(crossed), random_planes(case, 5)]
+    return [in_one_stack(parallel), in_one_stack(crossed), random_planes(case, 5)]
 
 
 def kept(cohort: Cohort, folder: Path) -> Path:

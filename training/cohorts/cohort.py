@@ -50,6 +50,11 @@ class Case:
     findings: tuple[str, ...] = ()
     stored: Grid | None = None
 
+    @property
+    def volume_ml(self) -> float:
+        """Volume of the object's voxels (mL)."""
+        return float(self.mask.sum() * np.prod(self.grid.spacing) / 1000.0)
+
 
 @dataclass(frozen=True)
 class Refusal:

@@ -166,7 +166,7 @@ def outliers(cases: Sequence[Case]) -> tuple[Refusal, ...]:
         return ()
     measures = (
         ("voxel spacing", "mm", np.stack([_sorted_spacing(case.grid) for case in cases]), LEAST_SPACING_SPREAD),
-        ("volume", "mL", np.array([[_volume_ml(case)] for case in cases]), LEAST_SIZE_SPREAD),
+        ("volume", "mL", np.array([[case.volume_ml] for case in cases]), LEAST_SIZE_SPREAD),
         ("extent", "mm", np.stack([_sorted_extent(case) for case in cases]), LEAST_SIZE_SPREAD),
     )
     reasons: dict[str, list[str]] = {}
@@ -189,10 +189,6 @@ def robust_deviations(values: Float[np.ndarray, "n m"], least: float) -> Float[n
 
 def _sorted_spacing(grid: Grid) -> Float[np.ndarray, "3"]:
     return np.asarray(np.sort(grid.spacing))
-
-
-def _volume_ml(case: Case) -> float:
-    return float(case.mask.sum() * np.prod(case.grid.spacing) / 1000.0)
 
 
 def _sorted_extent(case: Case) -> Float[np.ndarray, "3"]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from model.inference.mask_stack import MaskStack
 from training.cohorts.cohort import Case
-from training.oblique import SliceStacks, alone, random_planes
+from training.oblique import SliceStacks, in_one_stack, random_planes
 from training.points import Window
 from training.sparsify import EVERY, largest_slices, orthogonal, random_slices, thick, thin
 
@@ -27,28 +27,28 @@ def random_drawing(found: Window, rng: np.random.Generator) -> SliceStacks:
 
 
 def _largest(found: Window, _: np.random.Generator) -> SliceStacks:
-    return alone(orthogonal(found.mask, found.grid, largest_slices(found.mask)))
+    return in_one_stack(orthogonal(found.mask, found.grid, largest_slices(found.mask)))
 
 
 def _orthogonal(found: Window, rng: np.random.Generator) -> SliceStacks:
     """Slices anywhere or near the largest ones."""
     if rng.random() < 0.5:
-        return alone(orthogonal(found.mask, found.grid, random_slices(found.mask, rng)))
+        return in_one_stack(orthogonal(found.mask, found.grid, random_slices(found.mask, rng)))
     areas = [found.mask.sum(axis=others) for others in ((1, 2), (0, 2), (0, 1))]
     first, second, third = (int(rng.choice(np.flatnonzero(area >= LARGE_SHARE * area.max()))) for area in areas)
-    return alone(orthogonal(found.mask, found.grid, (first, second, third)))
+    return in_one_stack(orthogonal(found.mask, found.grid, (first, second, third)))
 
 
 def _parallel(found: Window, rng: np.random.Generator) -> SliceStacks:
     """Axial slices at equal distances, as often as not `EVERY`."""
     every = EVERY if rng.random() < 0.5 else int(rng.integers(GAPS[0], GAPS[1] + 1))
     drawn = thin(found.mask, found.grid, int(rng.integers(every)), every=every)
-    return alone(drawn) if drawn.planes else _largest(found, rng)
+    return in_one_stack(drawn) if drawn.planes else _largest(found, rng)
 
 
 def _thick(found: Window, rng: np.random.Generator) -> SliceStacks:
     drawn = thick(found.mask, found.grid, int(rng.integers(EVERY)))
-    return alone(drawn) if drawn.planes else _largest(found, rng)
+    return in_one_stack(drawn) if drawn.planes else _largest(found, rng)
 
 
 def _oblique(found: Window, rng: np.random.Generator) -> SliceStacks:

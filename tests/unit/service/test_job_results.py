@@ -1,6 +1,8 @@
 """What a job has made is read whole, or told to be gone or away."""
 
 import json
+import shutil
+import subprocess
 import zipfile
 
 import pytest
@@ -67,3 +69,14 @@ def test_no_file_is_left_half_written(tmp_path, left):
     with pytest.raises(Overloaded):
         write_zip(target, JobFiles(AwayBlobs(tmp_path, left), JOB), RECONSTRUCTIONS_JOB, 2)
     assert not target.exists()
+
+
+def test_a_file_that_cannot_be_opened_stays_as_it_is(tmp_path):
+    target, job = tmp_path / "all.zip", made(tmp_path)
+    shutil.copy(shutil.which("sleep"), target)
+    with subprocess.Popen([target, "60"]) as running:  # nobody may write a program that runs
+        before = target.read_bytes()
+        with pytest.raises(OSError, match="busy"):
+            write_zip(target, job, RECONSTRUCTIONS_JOB, 2)
+        assert target.read_bytes() == before
+        running.kill()

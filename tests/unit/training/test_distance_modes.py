@@ -11,7 +11,7 @@ from training.baselines.distance_modes import DistanceModes, sampled
 from training.baselines.kept_modes import digest_of, read_chosen
 from training.cohorts import Case, Cohort, Provenance
 from training.metrics_masks import dice
-from training.oblique import alone, random_planes
+from training.oblique import in_one_stack, random_planes
 from training.sparsify import for_evaluation
 
 GRID = Grid((40, 38, 42), np.array([[1.0, 0, 0, -20], [0, 1, 0, -19], [0, 0, 1, -21], [0, 0, 0, 1]]))
@@ -33,7 +33,7 @@ def modes():
 
 def drawing_of(case, regime):
     drawing = for_evaluation(case.mask, case.grid, regime)
-    return alone(drawing)
+    return in_one_stack(drawing)
 
 
 def test_distance_is_exact_beside_a_plane():

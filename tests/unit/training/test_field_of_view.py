@@ -6,6 +6,7 @@ import trimesh
 
 from model.geometry import Grid
 from model.inference.mesh import Mesh
+from training.cohorts.cohort import Case
 from training.field_of_view import in_view, volume_out_of_view_ml
 
 RADIUS = 20.0
@@ -27,35 +28,36 @@ def ball(centre_index: tuple[float, float, float], on: Grid) -> Mesh:
     return Mesh(vertices, np.asarray(found.faces), np.asarray(found.vertices) / RADIUS, {})
 
 
-def inside(mesh: Mesh, on: Grid) -> np.ndarray:
+def shown(mesh: Mesh, on: Grid) -> Case:
+    """What a crop shows of a ball."""
     centre = mesh.vertices.mean(axis=0)
-    return (np.linalg.norm(on.centres() - centre, axis=1) <= RADIUS).reshape(on.shape)
+    return Case("ball", "", "test", (np.linalg.norm(on.centres() - centre, axis=1) <= RADIUS).reshape(on.shape), on)
 
 
 @pytest.mark.parametrize("hidden_mm", [5.0, 20.0, 30.0])
 def test_the_cap_beyond_a_face_that_cuts_is_out_of_view(hidden_mm):
     on = grid(60)
     mesh = ball((15.0, 30.0, 59.5 - RADIUS + hidden_mm), on)
-    mask = inside(mesh, on)
+    case = shown(mesh, on)
     cap = np.pi * hidden_mm**2 * (RADIUS - hidden_mm / 3.0) / 1000.0
-    assert volume_out_of_view_ml(mask, on, mesh) == pytest.approx(cap, rel=0.03)
-    assert np.array_equal(in_view(mask, on, mesh.vertices), on.to_index(mesh.vertices)[:, 2] <= 59.5)
+    assert volume_out_of_view_ml(case, mesh) == pytest.approx(cap, rel=0.03)
+    assert np.array_equal(in_view(case, mesh.vertices), on.to_index(mesh.vertices)[:, 2] <= 59.5)
 
 
 def test_a_mesh_that_leaves_a_crop_which_holds_the_object_is_wrong_there():
     on = grid(60)
     mesh = ball((15.0, 30.0, 50.0), on)
-    mask = inside(ball((15.0, 30.0, 30.0), on), on)
-    assert not mask[:, :, -1].any()
-    assert in_view(mask, on, mesh.vertices).all()
-    assert volume_out_of_view_ml(mask, on, mesh) == 0.0
+    case = shown(ball((15.0, 30.0, 30.0), on), on)
+    assert not case.mask[:, :, -1].any()
+    assert in_view(case, mesh.vertices).all()
+    assert volume_out_of_view_ml(case, mesh) == 0.0
 
 
 def test_faces_that_do_not_cut_hide_nothing():
     """Cut at its first voxels along k, the mesh is also too far along i: that is an error."""
     on = grid(60)
-    mask = inside(ball((15.0, 30.0, 0.0), on), on)
+    case = shown(ball((15.0, 30.0, 0.0), on), on)
     moved = ball((28.0, 30.0, 30.0), on)
     assert on.to_index(moved.vertices)[:, 0].max() > 31.0
-    assert in_view(mask, on, moved.vertices).all()
-    assert volume_out_of_view_ml(mask, on, moved) == 0.0
+    assert in_view(case, moved.vertices).all()
+    assert volume_out_of_view_ml(case, moved) == 0.0

@@ -18,7 +18,7 @@ from tests.analytic_model import ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import cube_around
 from training.cohorts.cohort import Case
-from training.oblique import alone
+from training.oblique import in_one_stack
 from training.probability_scale import ProbabilityScale, as_facts, best_scale, cross_entropies
 from training.scored_drawing import BAND_MM, SCORED_VOXELS, near_surface, scored_drawing
 from training.sparsify import for_evaluation
@@ -38,7 +38,7 @@ CASE = Case("one", "one", "validation", Ellipsoid((13.0, 9.0, 6.5), CENTRE).mask
 
 @cache
 def drawing(regime="orthogonal"):
-    return scored_drawing(MODEL, CASE, alone(for_evaluation(CASE.mask, CASE.grid, regime)))
+    return scored_drawing(MODEL, CASE, in_one_stack(for_evaluation(CASE.mask, CASE.grid, regime)))
 
 
 def labelled(spread_mm, sharpness, copies=6):
