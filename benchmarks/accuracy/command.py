@@ -1,4 +1,4 @@
-"""The project beside what it competes with, in one run on the test shapes.
+"""The project beside what it competes with, in one run on held-out shapes.
 
 Every cell (cohort, case, drawing, method) is written as soon as it is measured; a run that was ended goes on where it
 stopped. At the end: ``table.md``, ``cells.csv``, the targets on standard output, and pictures.
@@ -23,6 +23,7 @@ from benchmarks.accuracy.targets import targets_of
 from model.bundle import MANIFEST, open_bundle, read_manifest
 from model.errors import InvalidParameter
 from training.baselines.distance_choice import kept
+from training.choices import SplitName
 from training.cohort_options import DataOption
 from training.cohorts import CohortName, CohortOptions, data_folder, load_cohort
 from training.console import exit_status, progress
@@ -39,7 +40,8 @@ def main(
     model: Annotated[list[str] | None, typer.Option(help="COHORT=BUNDLE; may repeat, shipped ones are there.")] = None,
     regimes: Annotated[list[DrawingName] | None, typer.Option(help="Drawings; may repeat, all when left out.")] = None,
     methods: Annotated[list[MethodName] | None, typer.Option(help="May repeat; all but adam when left out.")] = None,
-    cases: Annotated[int, typer.Option(min=1, help="Test cases of a cohort at most, evenly spaced.")] = 30,
+    split: Annotated[SplitName, typer.Option(help="Which held-out cases.")] = SplitName.TEST,
+    cases: Annotated[int, typer.Option(min=1, help="Cases of a cohort at most, evenly spaced.")] = 30,
     adam_cases: Annotated[int, typer.Option(min=0, help="First cases for the predecessor, with --methods adam.")] = 2,
     data: DataOption = None,
     output: Annotated[Path, typer.Option(help="Folder of cells, table and pictures.")] = OUTPUT,
@@ -58,7 +60,7 @@ def main(
         chosen = cohort or [name for name in CohortName if name in bundles]
         wanted = available(methods or [method for method in MethodName if method is not MethodName.ADAM])
         learned = cache if MethodName.PCA in wanted else None
-        plans = [_plan(name, bundles, data, learned, cases, adam_cases, threads) for name in chosen]
+        plans = [_plan(name, bundles, data, learned, split, cases, adam_cases, threads) for name in chosen]
         tasks = tasks_of(plans, regimes or list(DrawingName), wanted, tag)
         faults = _measure(tasks, CellFile(output / "cells.jsonl"), jobs)
         cells = _report(tasks, CellFile(output / "cells.jsonl"), output)
@@ -99,6 +101,7 @@ def _plan(
     bundles: dict[str, Path],
     data: Path | None,
     cache: Path | None,
+    split: SplitName,
     cases: int,
     adam_cases: int,
     threads: int,
@@ -106,11 +109,12 @@ def _plan(
     if name not in bundles:
         raise InvalidParameter(f"There is no model of {name}; --model {name}=BUNDLE names one.", part="model")
     found = load_cohort(name, data_folder(data), CohortOptions(skip_refused=True))
-    typer.echo(f"{name}: {min(cases, len(found.test))} of {len(found.test)} test cases", err=True)
+    held_out = found.of_split(split.value)
+    typer.echo(f"{name}: {min(cases, len(held_out))} of {len(held_out)} {split} cases", err=True)
     sources = Sources(bundles[name], kept(found, cache) if cache is not None else None, threads)
     manifest, _ = read_manifest(bundles[name])
     shippable = found.provenance.shippable and bool(manifest.training.get("weights_may_ship"))
-    return CohortPlan(name.value, chosen_cases(found.test, cases), adam_cases, sources, shippable, found.attribution)
+    return CohortPlan(name.value, chosen_cases(held_out, cases), adam_cases, sources, shippable, found.attribution)
 
 
 def _measure(tasks: Sequence[Task], file: CellFile, jobs: int) -> list[str]:

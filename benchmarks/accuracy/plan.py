@@ -25,7 +25,7 @@ class CohortPlan:
     """A cohort's part of a run.
 
     Attributes:
-        cases: test cases, in their order.
+        cases: held-out cases, in their order.
         adam_cases: the first of them, on which the predecessor is measured too.
         shippable: whether pictures of the cases may be published.
     """
