@@ -3,7 +3,8 @@ PYTHON ?= python3
 PORT ?= 8080
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check
+# Byte code is made of what is imported, not of all that is installed: half of the time of an installation.
+INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile -c constraints.txt
 LOCKS := pyproject.toml constraints.txt
 EXAMPLE := docs/examples/hippocampus_three_slices.nii.gz
 
@@ -19,15 +20,15 @@ $(BIN)/python:
 
 # A stamp for each level of set-up: what serves, and all that develops and tests.
 $(VENV)/.service: $(BIN)/python $(LOCKS)
-	$(PIP) install --quiet -c constraints.txt -e .
+	$(INSTALL) -e .
 	@touch $@
 
 $(VENV)/.demo: $(BIN)/python $(LOCKS)
-	$(PIP) install --quiet -c constraints.txt -e '.[demo]'
+	$(INSTALL) -e '.[demo]'
 	@touch $@ $(VENV)/.service
 
 $(VENV)/.development: $(BIN)/python $(LOCKS)
-	$(PIP) install --quiet -c constraints.txt -e '.[test,dev]'
+	$(INSTALL) -e '.[test,dev]'
 	@touch $@ $(VENV)/.service $(VENV)/.demo
 
 setup: $(VENV)/.development  ## install everything that develops and tests

@@ -1,15 +1,16 @@
-"""What the training commands have in common: exit status, findings, progress on a terminal."""
+"""What the training commands have in common: exit status, findings, progress on a terminal and in a log."""
 
 import os
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from time import monotonic
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from model.errors import CohortError, InputError, InvalidParameter, MorphoFlowError, NotFound
 from training.cohorts import Cohort
@@ -21,6 +22,8 @@ BAD_INPUT = (InputError, CohortError, NotFound)
 BAD_INPUT_STATUS, FAULT_STATUS = 2, 1
 #: 128 and the number of the signal.
 STOPPED_STATUS = 130
+#: Where there is no terminal, a line tells how far the work has come, at most so often (s).
+LINE_EVERY_S = 60.0
 
 
 @contextmanager
@@ -72,12 +75,35 @@ def warn(words: str) -> None:
 
 @contextmanager
 def progress(total: int, words: str) -> Iterator[Progress]:
-    """A bar of one task, shown on a terminal only."""
+    """A bar of one task on a terminal, and lines in a log."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+    shown = Progress(*columns, console=console, transient=True) if console.is_terminal else _Lines()
+    with shown as bar:
         bar.add_task(words, total=total)
         yield bar
+
+
+class _Lines(Progress):
+    """Tasks that are told of in a line now and then."""
+
+    def __init__(self) -> None:
+        super().__init__(disable=True)
+        self._told = monotonic()
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:
+        super().update(task_id, **changes)
+        self._tell(task_id)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        super().advance(task_id, advance)
+        self._tell(task_id)
+
+    def _tell(self, task_id: TaskID) -> None:
+        if monotonic() - self._told < LINE_EVERY_S:
+            return
+        self._told, task = monotonic(), self._tasks[task_id]
+        typer.echo(f"{task.description}: {task.completed:g} of {task.total or 0:g}", err=True)
 
 
 def tell_findings(cohort: Cohort) -> None:

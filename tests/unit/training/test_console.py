@@ -7,7 +7,7 @@ import typer
 
 from model.errors import InvalidParameter
 from tests.ellipsoid_cohort import GRID, ellipsoids
-from training import expectations
+from training import console, expectations
 from training.cohorts import Case, Cohort, Provenance
 from training.console import check_output, exit_status
 from training.interruption import Stopped
@@ -28,6 +28,20 @@ def test_a_path_that_cannot_be_used_is_one_sentence(capsys, tmp_path):
     words = capsys.readouterr().err
     assert "cannot be read or written: Not a directory" in words
     assert len(words.splitlines()) == 1
+
+
+class TestProgress:
+    def test_a_log_gets_a_line_now_and_then(self, capsys, monkeypatch):
+        monkeypatch.setattr(console, "LINE_EVERY_S", 0.0)
+        with console.progress(4, "fitting") as bar:
+            bar.advance(bar.task_ids[0])
+            bar.update(bar.task_ids[0], completed=3, total=5, description="measuring")
+        assert capsys.readouterr().err == "fitting: 1 of 4\nmeasuring: 3 of 5\n"
+
+    def test_short_work_writes_nothing_into_a_log(self, capsys):
+        with console.progress(1, "fitting") as bar:
+            bar.advance(bar.task_ids[0])
+        assert capsys.readouterr().err == ""
 
 
 class TestOutput:
