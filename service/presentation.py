@@ -12,6 +12,7 @@ from model.inference.estimates import Estimate, sd_of_estimate
 from model.inference.mask_stack import MaskStack, Plane, section_of
 from model.inference.next_plane import NextPlane
 from model.inference.reconstruction import SURFACE_SD
+from service.cautions import grid_cautions
 from service.colours import RAMP
 from service.ports import Outcome, StoredResult
 from service.request_schemas import PlaneSchema
@@ -82,7 +83,7 @@ def summary_of(outcome: Outcome) -> Summary:
         surface_sd=None if sd is None else _surface_sd(sd),
         log_prior_density_nats=answer.log_prior_density,
         typicality_percentile=answer.typicality_percentile,
-        warnings=list(answer.warnings),
+        warnings=[*answer.warnings, *grid_cautions(answer.mesh, outcome.grid)],
     )
 
 

@@ -1,0 +1,50 @@
+"""What a summary warns of that lies in the files and the steps of a request, over HTTP with the analytic model."""
+
+import re
+
+import numpy as np
+import pytest
+
+from tests.dicom_parts import file_bytes, mr_series, seg_of
+from tests.service_parts import app_for, image, running, sparse_ellipsoid
+
+RECONSTRUCTIONS = "/v1/reconstructions"
+CUT = "beyond the grid of the first mask"
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    with running(app_for(tmp_path_factory.mktemp("warnings"))) as client:
+        yield client
+
+
+def reconstructed(client, *masks, **form):
+    answer = client.post(RECONSTRUCTIONS, files=[("mask", ("m", mask)) for mask in masks], data=form)
+    assert answer.status_code == 201, answer.text
+    return answer.json()
+
+
+def warned(summary, words):
+    """The warnings with these words."""
+    return [sentence for sentence in summary["warnings"] if words in sentence]
+
+
+def labelled_ml(client, summary, **query):
+    labels = image(client.get(summary["links"]["segmentation"], params=query))
+    return np.count_nonzero(np.asarray(labels.dataobj)) * abs(np.linalg.det(labels.affine[:3, :3])) / 1000
+
+
+@pytest.mark.parametrize("empty_frames", [True, False])
+def test_a_segmentation_without_empty_frames_has_no_room_for_the_ends(client, empty_frames):
+    drawn, _ = sparse_ellipsoid()
+    mask = file_bytes(seg_of(mr_series(), drawn, omit_empty_frames=not empty_frames))
+    found = reconstructed(client, mask)
+    told, whole_ml = warned(found, CUT), found["volume_ml"]["value"]
+    assert bool(told) is not empty_frames
+    assert labelled_ml(client, found, spacing_mm=1) == pytest.approx(whole_ml, rel=0.02)
+    share = labelled_ml(client, found) / whole_ml
+    if empty_frames:
+        assert share == pytest.approx(1.0, rel=0.02)
+    else:
+        assert share < 0.95
+        assert int(re.search(r"show (\d+) %", told[0])[1]) == pytest.approx(100 * share, abs=3)
