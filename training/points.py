@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from model.geometry import Grid
@@ -28,6 +28,8 @@ FAR_COVER = 2000
 #: Points kept for all shapes together, and for one.
 TOTAL_POINTS = 20_000_000
 POINTS_RANGE = (20_000, 200_000)
+#: Points inside the object that a shape keeps at least, if its drawing has them.
+LEAST_INSIDE = 50
 #: The decoder's cube is this much larger than the largest training shape.
 EXTENT_FACTOR = 1.25
 
@@ -85,8 +87,7 @@ def shape_points(found: Window, regime: Regime, rng: np.random.Generator, limit:
     """Points of one random drawing, at most ``limit`` and a thin cover of the far background."""
     drawing = for_training(found.mask, found.grid, regime, rng)
     near = near_contour(drawing, regime)
-    index = np.argwhere(drawing.annotated & ~_unknown_on(drawing.stack.grid, found))
-    index = rng.permutation(index)[:limit]
+    index = _kept(rng.permutation(np.argwhere(_known(drawing, found))), drawing.stack.foreground, limit)
     world = np.concatenate([drawing.stack.grid.to_world(index.astype(float)), _far_cover(found, rng)])
     at = tuple(index.T)
     background = np.zeros(len(world) - len(index), bool)
@@ -123,6 +124,24 @@ def _distance(inside: Bool[np.ndarray, "*s"], spacing: Float[np.ndarray, "n"]) -
         return np.full(inside.shape, np.inf)
     distance = np.where(inside, distance_transform_edt(inside, spacing), distance_transform_edt(~inside, spacing))
     return np.asarray(distance)
+
+
+def _known(drawing: Drawing, found: Window) -> Bool[np.ndarray, "i j k"]:
+    """Voxels that the drawing tells of; those of the object too where all its slices stand beyond a cut."""
+    known = drawing.annotated & ~_unknown_on(drawing.stack.grid, found)
+    inside = drawing.stack.foreground
+    return known if (known & inside).any() else known | inside
+
+
+def _kept(index: Int[np.ndarray, "n 3"], inside: Bool[np.ndarray, "i j k"], limit: int) -> Int[np.ndarray, "m 3"]:
+    """The first voxels up to a limit, with `LEAST_INSIDE` of the object among them if there are so many."""
+    kept, more = index[:limit], index[limit:]
+    count = min(LEAST_INSIDE, limit) - int(inside[tuple(kept.T)].sum())
+    if count <= 0:
+        return kept
+    more = more[inside[tuple(more.T)]][:count]
+    spare = np.flatnonzero(~inside[tuple(kept.T)])[::-1][: len(more)]
+    return np.concatenate([np.delete(kept, spare, axis=0), more])
 
 
 def _unknown_on(grid: Grid, found: Window) -> Bool[np.ndarray, "i j k"]:

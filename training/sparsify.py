@@ -11,6 +11,10 @@ and sagittal are closest to A and R. Which slices are drawn:
 - orthogonal: one axial, one coronal and one sagittal slice through the object: random in training, those with the
   largest area in evaluation (the first one among equals).
 - dense: every axial slice.
+
+An object that spans no more than 8 axial slices is drawn at a third of its extent instead (`gap_for`), so that two thin
+slices at least show it if it has as many. Where a drawing would still show none of the object, as thick slices of a
+slanted sheet do, thin slices centred in it take its place.
 """
 
 from dataclasses import dataclass
@@ -27,6 +31,8 @@ Regime = Literal["thin", "thick", "orthogonal", "dense"]
 REGIMES: tuple[Regime, ...] = ("thin", "thick", "orthogonal", "dense")
 #: Sparsity of the thin and thick regimes (MorphoFlow paper, after Amiranashvili et al. 2024).
 EVERY = 8
+#: An object of no more than `EVERY` slices is drawn at gaps of its extent in so many parts.
+PARTS = 3
 
 
 @dataclass(frozen=True)
@@ -50,11 +56,14 @@ def body_axes(grid: Grid) -> tuple[int, int, int]:
 
 def for_training(mask: Bool[np.ndarray, "i j k"], grid: Grid, regime: Regime, rng: np.random.Generator) -> Drawing:
     """A random drawing of a mask that is not empty."""
+    every = gap_for(mask, body_axes(grid)[2])
     match regime:
         case "thin":
-            return thin(mask, grid, int(rng.integers(EVERY)), empty_slices=True)
+            drawn = thin(mask, grid, int(rng.integers(every)), every=every, empty_slices=True)
+            return _showing(drawn, mask, grid, every, empty_slices=True)
         case "thick":
-            return thick(mask, grid, int(rng.integers(EVERY)), empty_slices=True)
+            drawn = thick(mask, grid, int(rng.integers(every)), every=every, empty_slices=True)
+            return _showing(drawn, mask, grid, every, empty_slices=True)
         case "orthogonal":
             return orthogonal(mask, grid, random_slices(mask, rng))
         case "dense":
@@ -72,11 +81,14 @@ def for_evaluation(
         offset: first drawn slice of the grid for thin and thick; slices centred in the object when None.
     """
     axial = body_axes(grid)[2]
+    every = gap_for(mask, axial)
     match regime:
         case "thin":
-            return thin(mask, grid, centred_offset(mask, axial) if offset is None else offset)
+            first = centred_offset(mask, axial, every) if offset is None else offset
+            return _showing(thin(mask, grid, first, every=every), mask, grid, every)
         case "thick":
-            return thick(mask, grid, centred_block(mask, axial) if offset is None else offset)
+            first = centred_block(mask, axial, every) if offset is None else offset
+            return _showing(thick(mask, grid, first, every=every), mask, grid, every)
         case "orthogonal":
             return orthogonal(mask, grid, largest_slices(mask))
         case "dense":
@@ -130,6 +142,13 @@ def dense(mask: Bool[np.ndarray, "i j k"], grid: Grid) -> Drawing:
     return _draw(mask, grid, [(axial, index) for index in range(mask.shape[axial])])
 
 
+def gap_for(mask: Bool[np.ndarray, "i j k"], axis: int) -> int:
+    """Slices from one drawn slice to the next: `EVERY`, or a third of those that a shorter object spans."""
+    first, last = _range(mask, axis)
+    count = last + 1 - first
+    return EVERY if count > EVERY else -(-count // PARTS)
+
+
 def centred_offset(mask: Bool[np.ndarray, "i j k"], axis: int, every: int = EVERY) -> int:
     """First of the slices that stand centred in the object: equal gaps (to one slice) at both of its ends."""
     first, last = _range(mask, axis)
@@ -152,6 +171,18 @@ def random_slices(mask: Bool[np.ndarray, "i j k"], rng: np.random.Generator) -> 
     """A random slice that holds foreground across each index axis."""
     first, second, third = (np.flatnonzero(mask.any(axis=other)) for other in ((1, 2), (0, 2), (0, 1)))
     return int(rng.choice(first)), int(rng.choice(second)), int(rng.choice(third))
+
+
+def _showing(
+    drawn: Drawing, mask: Bool[np.ndarray, "i j k"], grid: Grid, every: int, *, empty_slices: bool = False
+) -> Drawing:
+    """The drawing if it shows some of the object, or centred thin slices at the largest gap, up to this, that do."""
+    axial = body_axes(grid)[2]
+    for gap in range(every, 0, -1):
+        if drawn.stack.foreground.any():
+            break
+        drawn = thin(mask, grid, centred_offset(mask, axial, gap), every=gap, empty_slices=empty_slices)
+    return drawn
 
 
 def _draw(mask: Bool[np.ndarray, "i j k"], grid: Grid, chosen: list[tuple[int, int]]) -> Drawing:

@@ -4,7 +4,7 @@ import pytest
 from model.geometry import Grid
 from tests.analytic_shapes import Ellipsoid
 from training.cohorts import Case
-from training.points import BAND_MM, cohort_points, decoder_extent, shape_points, window
+from training.points import BAND_MM, LEAST_INSIDE, cohort_points, decoder_extent, shape_points, window
 from training.sparsify import REGIMES
 
 AFFINE = np.array([[0.0, 0.0, 1.5, -20.0], [-1.0, 0.0, 0.0, 30.0], [0.0, 1.0, 0.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
@@ -59,6 +59,29 @@ def test_beyond_a_face_that_cuts_the_object_nothing_is_said():
         inside_columns = (open_end[:, :2] > 3).all(axis=1) & (open_end[:, :2] < 6).all(axis=1)
         assert not (open_end[inside_columns, 2] > 9.5 + 4).any()
         assert (closed[:, 2] > 9.5).any()
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize(("slices", "margin"), [(1, 3), (2, 3), (5, 3), (7, 3), (4, 0)])
+def test_flat_objects_have_points_inside_whatever_the_drawing(regime, slices, margin):
+    mask = np.zeros((14, 14, slices + 2 * margin), bool)
+    mask[3:11, 3:11, margin : margin + slices] = True
+    case = Case("flat", "flat", "train", mask, Grid(mask.shape, np.diag([2.0, 2.0, 10.0, 1.0])))
+    for seed in range(10):
+        found = shape_points(window(case), regime, np.random.default_rng(seed), LIMIT)
+        assert found.labels.any()
+    assert decoder_extent([found]) > 0.0
+
+
+def test_a_small_limit_leaves_points_inside():
+    mask = np.zeros((60, 60, 60), bool)
+    mask[30, 20:40, 30:34] = True
+    case = Case("thread", "thread", "train", mask, Grid(mask.shape, np.eye(4)))
+    known = window(case)
+    few = shape_points(known, "dense", np.random.default_rng(0), 200)
+    assert few.labels.sum() == LEAST_INSIDE
+    least = shape_points(known, "dense", np.random.default_rng(0), 20)
+    assert least.labels.sum() == 20
 
 
 def test_points_are_a_pure_function_of_their_seed():

@@ -14,6 +14,7 @@ from training.sparsify import (
     dense,
     for_evaluation,
     for_training,
+    gap_for,
     largest_slices,
     orthogonal,
     random_slices,
@@ -98,14 +99,16 @@ def test_thin_slices_of_an_evaluation_are_centred_in_the_object(found):
     mask, grid = found
     axis = body_axes(grid)[2]
     occupied = np.flatnonzero(along(mask, axis).any(axis=(1, 2)))
-    first = centred_offset(mask, axis)
-    slices = np.arange(first, occupied[-1] + 1, EVERY)
+    every = gap_for(mask, axis)
+    first = centred_offset(mask, axis, every)
+    slices = np.arange(first, occupied[-1] + 1, every)
     before, after = first - occupied[0], occupied[-1] - slices[-1]
     assert before >= 0
     assert after - before in (0, 1)
-    assert len(slices) == -(-(occupied[-1] - occupied[0] + 1) // EVERY)
-    drawn = for_evaluation(mask, grid, "thin").planes
-    assert {plane.index for plane in drawn} == {n for n in slices if n in occupied}
+    assert len(slices) == -(-(occupied[-1] - occupied[0] + 1) // every)
+    if np.isin(slices, occupied).any():
+        drawn = for_evaluation(mask, grid, "thin").planes
+        assert {plane.index for plane in drawn} == {n for n in slices if n in occupied}
 
 
 @given(masks(), st.integers(-20, 20))
@@ -189,7 +192,41 @@ def test_evaluation_counts_planes_with_foreground_only_unless_dense(found, regim
     drawing = for_evaluation(mask, grid, regime)
     filled = [along(drawing.stack.foreground, plane.axis)[plane.index].any() for plane in drawing.planes]
     assert all(filled) or regime == "dense"
-    assert drawing.stack.foreground.any() or regime in ("thin", "thick")
+
+
+@given(masks(), st.sampled_from(REGIMES), st.integers(0, 100))
+def test_every_drawing_shows_some_of_the_object(found, regime, seed):
+    mask, grid = found
+    drawings = (
+        for_evaluation(mask, grid, regime),
+        for_evaluation(mask, grid, regime, offset=seed),
+        for_training(mask, grid, regime, np.random.default_rng(seed)),
+    )
+    assert all(drawing.stack.foreground.any() for drawing in drawings)
+
+
+@given(st.integers(1, 30), st.integers(0, 5), st.integers(0, 100))
+def test_a_short_object_is_drawn_on_two_thin_slices_and_a_long_one_at_the_full_gap(count, before, seed):
+    mask = np.zeros((3, 3, before + count + 2), bool)
+    mask[1, 1, before : before + count] = True
+    grid = Grid(mask.shape, np.eye(4))
+    drawing = for_training(mask, grid, "thin", np.random.default_rng(seed))
+    shown = [plane.index for plane in drawing.planes if mask[:, :, plane.index].any()]
+    if count > EVERY:
+        offset = int(np.random.default_rng(seed).integers(EVERY))
+        assert drawing.planes == thin(mask, grid, offset, empty_slices=True).planes
+    else:
+        assert len(shown) >= min(2, count)
+        assert gap_for(mask, 2) <= EVERY // 2
+
+
+def test_thick_slices_of_a_slanted_sheet_give_way_to_thin_ones():
+    mask = np.zeros((3, 40, 40), bool)
+    mask[1, np.arange(40), np.arange(40)] = True
+    grid = Grid(mask.shape, np.eye(4))
+    for drawing in (for_evaluation(mask, grid, "thick"), for_training(mask, grid, "thick", np.random.default_rng(0))):
+        assert drawing.stack.grid.coincides_with(grid)
+        assert drawing.stack.foreground.sum() == 5
 
 
 def test_a_fixed_offset_is_counted_from_the_grid():
