@@ -37,6 +37,7 @@ from service.schemas import (
     Summary,
     SurfaceSdSummary,
 )
+from service.use_cases import notes_of
 
 
 def summary_of(outcome: Outcome) -> Summary:
@@ -122,6 +123,7 @@ def drawn_planes(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> DrawnP
             )
             for plane in planes
         ],
+        warnings=list(notes_of(stacks)),
     )
 
 

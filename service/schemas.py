@@ -37,6 +37,7 @@ class DrawnPlanes(BaseModel):
     unit: Literal["mm"] = "mm"
     stacks: list[StackSchema]
     planes: list[DrawnPlaneSchema]
+    warnings: list[str] = Field(description="what a summary would warn of in the files")
 
 
 class EstimateSchema(BaseModel):

@@ -42,6 +42,8 @@ def reconstruct(
 ) -> Outcome:
     """Reconstruct the object of the stacks; the first one's grid is the input's grid.
 
+    What the stacks' notes say is among the warnings.
+
     Args:
         max_voxels: of the grid in which the surface is looked for; any number when None.
         watch: told the name of each stage as it begins.
@@ -52,7 +54,13 @@ def reconstruct(
     """
     reconstruction = infer(interruptible(model, check), stacks, options, watch, max_voxels)
     manifest = model.manifest
-    return Outcome(manifest.name, manifest.version, model.digest, options, stacks[0].grid, reconstruction)
+    told = replace(reconstruction, warnings=(*reconstruction.warnings, *notes_of(stacks)))
+    return Outcome(manifest.name, manifest.version, model.digest, options, stacks[0].grid, told)
+
+
+def notes_of(stacks: Sequence[MaskStack]) -> tuple[str, ...]:
+    """What the stacks' notes say, each once."""
+    return tuple(dict.fromkeys(note for stack in stacks for note in stack.notes))
 
 
 @dataclass(frozen=True)

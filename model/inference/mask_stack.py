@@ -19,6 +19,7 @@ class MaskStack:
         foreground: (i, j, k) voxels of the object.
         excluded: (i, j, k) voxels that were never looked at (value 255), whatever the planes say.
         space: world in which answers about this volume are told; its grid is RAS all the same.
+        notes: sentences that answers about it must tell, for example of what its file left open.
     """
 
     part: str
@@ -26,6 +27,7 @@ class MaskStack:
     foreground: Bool[np.ndarray, "i j k"]
     excluded: Bool[np.ndarray, "i j k"]
     space: Space = "RAS"
+    notes: tuple[str, ...] = ()
 
 
 def common_space(stacks: Sequence[MaskStack]) -> Space:

@@ -54,10 +54,12 @@ class Volume:
     Attributes:
         values: any number of axes.
         affine: (4, 4) from voxel index to world RAS mm, as the header says it, unchecked.
+        oriented: whether the header declares the directions of the axes.
     """
 
     values: Shaped[np.ndarray, "..."]
     affine: Float[np.ndarray, "4 4"]
+    oriented: bool = True
 
 
 @contextmanager

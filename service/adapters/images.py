@@ -7,12 +7,15 @@ native parser meets what a stranger sent.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import import_module
 from typing import BinaryIO, Literal
 
 import numpy as np
+from nibabel.orientations import aff2axcodes
 
 from model.errors import UnreadableImage
+from model.geometry import Grid
 from model.inference.observations import MaskStack
 from model.inference.stacks import checked_labels, make_stack
 from service.adapters.image_guard import ImageLimits, Source, Volume, opened
@@ -24,6 +27,9 @@ __all__ = ["ImageFormat", "ImageLimits", "Source", "image_format", "read_mask", 
 
 #: Where a DICOM file says that it is one (PS3.10, 7.1).
 DICOM_PREFIX = slice(128, 132)
+
+#: Where an axis points, by its letter.
+_DIRECTIONS = {"L": "left", "R": "right", "P": "posterior", "A": "anterior", "I": "inferior", "S": "superior"}
 
 ImageFormat = Literal["nifti", "nrrd", "metaimage", "dicom"]
 
@@ -49,6 +55,9 @@ def read_mask(source: Source, part: str, limits: ImageLimits, labels: frozenset[
         part: how the caller knows the image in messages, for example ``mask[0]``.
         labels: the object's label values; all but 0 and 255 when None.
 
+    Returns:
+        the stack, with a note where the file declares no orientation.
+
     Raises:
         UnreadableImage: no NIfTI, NRRD or MetaImage, or a damaged one.
         TooLarge: over a limit.
@@ -58,7 +67,8 @@ def read_mask(source: Source, part: str, limits: ImageLimits, labels: frozenset[
     # Affines from hostile headers may overflow on the way; make_stack refuses what comes of it.
     with opened(source, part, limits) as file, np.errstate(all="ignore"):
         volume = _read(file, part, limits, labels)
-    return make_stack(part, volume.values, volume.affine, labels)
+    stack = make_stack(part, volume.values, volume.affine, labels)
+    return stack if volume.oriented else replace(stack, notes=(_orientation_note(part, stack.grid),))
 
 
 def image_format(file: BinaryIO) -> ImageFormat | None:
@@ -87,6 +97,15 @@ def _read(file: BinaryIO, part: str, limits: ImageLimits, labels: frozenset[int]
     raise UnreadableImage(
         f"{part} is not a readable image; NIfTI, NRRD, MetaImage, DICOM SEG and RTSTRUCT in a single file are accepted",
         part=part,
+    )
+
+
+def _orientation_note(part: str, grid: Grid) -> str:
+    """What to tell where the axes' directions are the format's convention."""
+    first, second, third = (_DIRECTIONS[letter] for letter in aff2axcodes(grid.affine))
+    return (
+        f"{part} declares no orientation; its axes were taken to point {first}, {second} and {third}, so that left and "
+        "right may be exchanged."
     )
 
 

@@ -73,7 +73,8 @@ def read_metaimage(file: BinaryIO, part: str, limits: ImageLimits) -> Volume:
         raise UnreadableImage(f"{part} has voxels of an unknown type; binary numbers are accepted", part=part)
     kind = np.dtype(order + VOXEL_TYPES[fields["ElementType"]])
     encoding = "zlib" if _is_true(fields, "CompressedData") else "raw"
-    return Volume(read_voxels(file, Stored(encoding, kind, shape), part, limits), affine)
+    values = read_voxels(file, Stored(encoding, kind, shape), part, limits)
+    return Volume(values, affine, oriented="TransformMatrix" in fields)
 
 
 def _header(file: BinaryIO, part: str) -> dict[str, str]:

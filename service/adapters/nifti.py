@@ -69,7 +69,8 @@ def read_nifti(file: BinaryIO, part: str, limits: ImageLimits) -> Volume:
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
     stored = Stored("gzip" if zipped else "raw", kind, shape, start, scaled)
-    return Volume(read_voxels(file, stored, part, limits), affine)
+    oriented = bool(header["sform_code"] != 0 or header["qform_code"] != 0)
+    return Volume(read_voxels(file, stored, part, limits), affine, oriented)
 
 
 def _parsed(head: bytes, part: str) -> Any:

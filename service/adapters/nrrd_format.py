@@ -94,7 +94,7 @@ def read_nrrd(file: BinaryIO, part: str, limits: ImageLimits, labels: frozenset[
     values = _values(file, fields, shape, part, limits)
     if layered and values.shape == shape:
         values = merged(values, labels, layers_by_value(header.pairs), part)
-    return Volume(values, affine)
+    return Volume(values, affine, oriented={"space", "space directions"} <= fields.keys())
 
 
 @dataclass(frozen=True)

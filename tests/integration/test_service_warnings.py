@@ -2,11 +2,12 @@
 
 import re
 
+import nibabel as nib
 import numpy as np
 import pytest
 
 from tests.dicom_parts import file_bytes, mr_series, seg_of
-from tests.service_parts import app_for, image, running, sparse_ellipsoid
+from tests.service_parts import app_for, image, mask_bytes, running, sparse_ellipsoid
 
 RECONSTRUCTIONS = "/v1/reconstructions"
 CUT = "beyond the grid of the first mask"
@@ -48,3 +49,11 @@ def test_a_segmentation_without_empty_frames_has_no_room_for_the_ends(client, em
     else:
         assert share < 0.95
         assert int(re.search(r"show (\d+) %", told[0])[1]) == pytest.approx(100 * share, abs=3)
+
+
+def test_a_guessed_orientation_is_told_before_and_after(client):
+    bare = nib.Nifti1Image(sparse_ellipsoid()[0], None)
+    told = warned(reconstructed(client, mask_bytes(), bare.to_bytes(), uncertainty="none"), "declares no orientation")
+    assert [sentence.partition(" ")[0] for sentence in told] == ["mask[1]"]
+    before = client.post("/v1/planes", files=[("mask", ("m", mask)) for mask in (mask_bytes(), bare.to_bytes())])
+    assert before.json()["warnings"] == told

@@ -184,6 +184,37 @@ def test_all_formats_of_itk_give_the_same_voxels_in_the_same_world(tmp_path, nam
     stack = read_mask(data, "mask[0]", LIMITS)
     np.testing.assert_array_equal(stack.foreground, drawn() == 1)
     np.testing.assert_allclose(stack.grid.affine, affine, atol=2e-4)
+    assert stack.notes == ()
+
+
+def plain_nifti():
+    """A NIfTI that declares spacings alone."""
+    return nib.Nifti1Image(drawn(), None).to_bytes()
+
+
+@pytest.mark.parametrize(
+    ("data", "axes"),
+    [
+        (plain_nifti(), "left, anterior and superior"),
+        (nrrd_text("6 7 8").replace(b"space: left-posterior-superior\n", b""), "left, posterior and superior"),
+        (
+            nrrd_text("6 7 8", "(0,1,0) (1,0,0) (0,0,1)").replace(
+                b"space: left-posterior-superior", b"space dimension: 3"
+            ),
+            "posterior, left and superior",
+        ),
+        (mha_text().replace(b"TransformMatrix = 1 0 0 0 1 0 0 0 1\n", b""), "left, posterior and superior"),
+    ],
+)
+def test_an_orientation_that_no_file_declares_is_noted(data, axes):
+    (note,) = read_mask(data, "mask[3]", LIMITS).notes
+    assert note.startswith("mask[3] declares no orientation")
+    assert axes in note
+
+
+@pytest.mark.parametrize("data", [nifti(drawn()), nrrd_text("6 7 8"), mha_text()])
+def test_a_declared_orientation_needs_no_note(data):
+    assert read_mask(data, "mask[0]", LIMITS).notes == ()
 
 
 @pytest.mark.parametrize(
