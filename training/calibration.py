@@ -21,15 +21,15 @@ from model.inference.discrepancy.conditioning import DiscrepancyPrior
 from model.inference.posterior import fitted_logits
 from model.inference.typicality import peak_density
 from model.inference.uncertainty import sharpness_of
+from training.answerable import answerable_cases, answerable_drawings, naming
 from training.cohorts.cohort import Case, Cohort, evenly
 from training.config import Regime
 from training.evaluate import surface_distance
-from training.oblique import SliceStacks, in_one_stack
+from training.oblique import SliceStacks
 from training.posterior_scale import posterior_scale
 from training.probability_scale import as_facts, best_scale, cross_entropies
-from training.scored_drawing import scored_drawing
+from training.scored_drawing import ScoredDrawing, scored_drawing
 from training.seen import check_unseen
-from training.sparsify import for_evaluation
 from training.usual import sound_answers, typical_figures, usual_figures
 
 #: Precisions that are tried (1/mm^2), fidelities, and the regimes that they are tried on.
@@ -74,21 +74,22 @@ class Calibration:
 
 def calibrate(model: ShapeModel, cases: Sequence[Case], advance: Advance = lambda: None) -> Calibration:
     """Choose for a model on cases that it was not trained on."""
-    chosen = evenly(cases, CASES)
+    chosen = answerable_cases(evenly(cases, CASES), REGIMES)
     totals: dict[Trust, list[float]] = {}
     for precision in PRECISIONS:
         trial = with_precision(model, precision)
         for case in chosen:
-            for drawing in drawings_of(case):
-                for trust, error in _errors(trial, case, drawing):
-                    totals.setdefault(trust, []).append(error)
+            for name, drawing in drawings_of(case).items():
+                with naming(case, name):
+                    for trust, error in _errors(trial, case, drawing):
+                        totals.setdefault(trust, []).append(error)
         advance()
     return Calibration({trust: float(np.mean(values)) for trust, values in totals.items()})
 
 
-def drawings_of(case: Case) -> list[SliceStacks]:
-    """The drawings of a case that a model is calibrated on."""
-    return [in_one_stack(for_evaluation(case.mask, case.grid, regime)) for regime in REGIMES]
+def drawings_of(case: Case) -> dict[Regime, SliceStacks]:
+    """The drawings of a case that a model is calibrated on, by regime."""
+    return answerable_drawings(case, REGIMES)
 
 
 def calibrate_bundle(
@@ -101,6 +102,7 @@ def calibrate_bundle(
     Raises:
         BundleError: the bundle cannot be trusted.
         InvalidParameter: the model was trained on one of the cases.
+        CohortError: a drawing of a case cannot be reconstructed, or none shows enough.
     """
     model = uncalibrated_share(open_bundle(folder, threads=threads))
     check_unseen(model.manifest, cohort.validation)
@@ -150,12 +152,12 @@ def uncalibrated_share(model: ShapeModel) -> ShapeModel:
 
 def with_share(model: ShapeModel, cases: Sequence[Case], advance: Advance = lambda: None) -> ShapeModel:
     """The model with the least weight of completed drawings that brings surfaces nearest to the masks."""
-    chosen = evenly(cases, WEIGHED_CASES)
+    chosen = answerable_cases(evenly(cases, WEIGHED_CASES), REGIMES)
     distances: dict[float, float] = {}
     for share in SHARES:
         trial = counting(model, share)
         distances[share] = float(
-            np.mean([surface_distance(trial, case, regime) for case in chosen for regime in REGIMES])
+            np.mean([surface_distance(trial, case, regime) for case in chosen for regime in drawings_of(case)])
         )
         advance()
     best = min(share for share in SHARES if distances[share] <= (1.0 + TIE) * min(distances.values()))
@@ -165,9 +167,8 @@ def with_share(model: ShapeModel, cases: Sequence[Case], advance: Advance = lamb
 
 def with_probability_scale(model: ShapeModel, cases: Sequence[Case]) -> ShapeModel:
     """The model with the spread of its discrepancy and the sharpness that make probabilities right, all else given."""
-    chosen = evenly(cases, WEIGHED_CASES)
-    drawings = (scored_drawing(model, case, drawing) for case in chosen for drawing in drawings_of(case))
-    found = cross_entropies(model, drawings)
+    chosen = answerable_cases(evenly(cases, WEIGHED_CASES), REGIMES)
+    found = cross_entropies(model, _scored(model, chosen))
     best = best_scale(found)
     return changed(
         model,
@@ -217,6 +218,14 @@ def with_sound_drawings(model: ShapeModel, cases: Sequence[Case], advance: Advan
 def with_precision(model: ShapeModel, precision: float) -> ShapeModel:
     """The model with another likelihood precision (1/mm^2)."""
     return changed(model, likelihood_precision=precision)
+
+
+def _scored(model: ShapeModel, cases: Sequence[Case]) -> Iterator[ScoredDrawing]:
+    for case in cases:
+        for name, drawing in drawings_of(case).items():
+            with naming(case, name):
+                found = scored_drawing(model, case, drawing)
+            yield found
 
 
 def _errors(model: ShapeModel, case: Case, drawn: SliceStacks) -> Iterator[tuple[Trust, float]]:

@@ -21,6 +21,7 @@ from model.errors import InputError, InvalidParameter, UnknownModel
 from model.geometry import Grid
 from model.inference.one_body import body_mask
 from model.inference.reconstruction import Options, reconstruct
+from training.answerable import naming
 from training.baselines.contours import contour_fill
 from training.baselines.interpolation import signed_distance_interpolation
 from training.cohorts.cohort import Case
@@ -176,8 +177,13 @@ def fills_of(model: ShapeModel, seed: int) -> dict[Method, Fill]:
 
 
 def surface_distance(model: ShapeModel, case: Case, regime: Regime, *, seed: int = 0) -> float:
-    """Average surface distance (mm) of the reconstruction of one drawing from the dense mask."""
-    found = fills_of(model, seed)[Method.MODEL](for_evaluation(case.mask, case.grid, regime), case.grid)
+    """Average surface distance (mm) of the reconstruction of one drawing from the dense mask.
+
+    Raises:
+        CohortError: the drawing cannot be reconstructed; names the case.
+    """
+    with naming(case, regime):
+        found = fills_of(model, seed)[Method.MODEL](for_evaluation(case.mask, case.grid, regime), case.grid)
     return agreement(case.mask, found, case.grid.spacing).asd_mm
 
 

@@ -91,10 +91,13 @@ def _stack(number: int, labels: Bool[np.ndarray, "i j k"], grid: Grid, corner: F
 
 
 def parallel(mask: Bool[np.ndarray, "i j k"], grid: Grid, count: int = 5) -> Sections:
-    """Slices across the object's longest body axis, with equal gaps between them and to its ends."""
+    """Slices across the object's longest body axis, with equal gaps between them and to its ends.
+
+    Where it has fewer slices than that, each is drawn once.
+    """
     axis, first, last = _longest(mask, grid)
     places = first + (np.arange(count) + 0.5) * (last + 1 - first) / count
-    return sections_of(_drawing(mask, grid, axis, [int(place) for place in places]))
+    return sections_of(_drawing(mask, grid, axis, sorted({int(place) for place in places})))
 
 
 def one_end(mask: Bool[np.ndarray, "i j k"], grid: Grid, every: int = 3) -> Sections:

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from model.bundle import ShapeModel
 from model.errors import InvalidParameter
+from training.answerable import answerable_cases, answerable_drawings
 from training.calibration import PRECISIONS, Advance, with_precision
 from training.cohorts.cohort import Case, evenly, listed
 from training.config import Regime
@@ -72,9 +73,10 @@ def chosen_parts(
 
     Raises:
         InvalidParameter: the run is not finished, or was trained on one of the cases.
+        CohortError: a drawing of a case cannot be reconstructed, or none shows enough.
     """
     _check_unseen(run, cases)
-    used = evenly(cases, CASES)
+    used = answerable_cases(evenly(cases, CASES), regimes)
 
     def errors(model: ShapeModel, precision: float) -> Float[np.ndarray, "n"]:
         found = _errors(model, precision, used, regimes)
@@ -132,4 +134,5 @@ def _errors(
 ) -> Float[np.ndarray, "n"]:
     """Average surface distance (mm) of each case at a likelihood precision (1/mm^2), mean over its drawings."""
     trial = with_precision(model, precision)
-    return np.array([np.mean([surface_distance(trial, case, regime) for regime in regimes]) for case in cases])
+    drawn = [(case, answerable_drawings(case, regimes)) for case in cases]
+    return np.array([np.mean([surface_distance(trial, case, regime) for regime in found]) for case, found in drawn])

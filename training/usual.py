@@ -6,7 +6,7 @@ planes is fitted to each figure; the highest usual value is that line moved up t
 where those of a few cases are too few to know it, to the one that Student's prediction of a further case puts there.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,10 +23,11 @@ from model.inference.reconstruction import COVER_SHARE_OF_BAND, OBSERVATION_BUDG
 from model.inference.reliability import MOST_USUAL_PLANES, USUAL_PLANES, Figures, figures_of
 from model.inference.typicality import rarity
 from model.inference.uncertainty import surface_spread
+from training.answerable import answerable, naming
 from training.cohorts.cohort import Case
 from training.field_of_view import in_view, volume_out_of_view_ml
 from training.perturb import Sections, parallel, sections_of
-from training.sparsify import for_evaluation
+from training.sparsify import Regime, for_evaluation
 from training.surface_error import digitisation_mm, distances_to, true_points
 
 #: Share of sound drawings that stay below the highest usual value of one figure.
@@ -65,7 +66,7 @@ def sound_answers(model: ShapeModel, cases: Sequence[Case]) -> list[Sound]:
     """Answers to sound drawings of cases that a model was not trained on."""
     # What was known before is forgotten, lest it change the answers.
     unjudged = replace(model, manifest=replace(model.manifest, usual={}, posterior={}, typical={}))
-    return [answered(unjudged, case, drawing) for case in cases for drawing in sound_drawings(case)]
+    return [answered(unjudged, case, name, drawn) for case in cases for name, drawn in sound_drawings(case).items()]
 
 
 def usual_figures(sound: Sequence[Sound], cases: int) -> dict[str, float]:
@@ -107,17 +108,22 @@ def typical_figures(sound: Sequence[Sound], cases: int, peak: float) -> dict[str
     return found
 
 
-def sound_drawings(case: Case) -> Iterator[Sections]:
-    """Drawings as they should be."""
-    yield sections_of(for_evaluation(case.mask, case.grid, "orthogonal"))
-    yield sections_of(for_evaluation(case.mask, case.grid, "thin"))
-    for count in PARALLEL:
-        yield parallel(case.mask, case.grid, count)
+def sound_drawings(case: Case) -> dict[str, Sections]:
+    """Drawings as they should be, by name; those that show the object on too few planes are left out."""
+    regimes: tuple[Regime, ...] = ("orthogonal", "thin")
+    drawings = {regime: sections_of(for_evaluation(case.mask, case.grid, regime)) for regime in regimes}
+    across = {f"{count} parallel slices": parallel(case.mask, case.grid, count) for count in PARALLEL}
+    return answerable({**drawings, **across})
 
 
-def answered(model: ShapeModel, case: Case, drawing: Sections) -> Sound:
-    """The answer to a drawing of a case, measured."""
-    answer = reconstruct(model, drawing.stacks, Options(annotated=drawing.planes))
+def answered(model: ShapeModel, case: Case, name: str, drawing: Sections) -> Sound:
+    """The answer to a drawing of a case, measured.
+
+    Raises:
+        CohortError: there is none; names the case and the drawing.
+    """
+    with naming(case, name):
+        answer = reconstruct(model, drawing.stacks, Options(annotated=drawing.planes))
     found, mesh = answer.state.fits[0], answer.mesh
     observations = observe(drawing.stacks, drawing.planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=0)
     figures = figures_of(model, found, drawing.stacks, observations, mesh, discrepancy_prior(model.manifest))
