@@ -19,9 +19,10 @@ from model.inference.next_plane import next_plane as best_plane
 from model.inference.observations import AnnotatedRule, MaskStack, Plane, find_planes
 from model.inference.one_body import OCCUPIED, body_mask, body_probability
 from model.inference.posterior_shapes import PosteriorShape, draw_posterior
-from model.inference.reconstruction import SURFACE_SD, Options, Watch, unwatched
+from model.inference.reconstruction import SURFACE_SD, Options, Watch, farthest_mm, unwatched
 from model.inference.reconstruction import reconstruct as infer
 from model.inference.sampling import SampledShape, draw_shape
+from model.inference.stacks import require_length
 from model.inference.surface import covering_grid, require_step
 from model.inference.uncertainty import ShapeState, voxel_entropy
 from model.interruption import Check, interruptible, unchecked
@@ -52,6 +53,7 @@ def reconstruct(
     Raises:
         InputError: the stacks or options cannot be used; the sentence says why.
     """
+    require_length(stacks, farthest_mm(model))
     reconstruction = infer(interruptible(model, check), stacks, options, watch, max_voxels)
     manifest = model.manifest
     told = replace(reconstruction, warnings=(*reconstruction.warnings, *notes_of(stacks)))

@@ -11,7 +11,7 @@ from jaxtyping import Float, Shaped
 
 from model.errors import InvalidGeometry, InvalidMask, InvalidParameter
 from model.geometry import SHEAR_TOLERANCE, Grid
-from model.inference.mask_stack import MaskStack
+from model.inference.mask_stack import MaskStack, index_box
 
 #: Value of voxels that were never looked at.
 EXCLUDED_VALUE = 255
@@ -25,6 +25,8 @@ ROUNDING_TOLERANCE = 1e-4
 LABEL_LIMIT = 256
 #: Labels listed in a message, at most.
 LISTED_LABELS = 12
+#: An object that is this many times as long as the model's box has its voxels in another unit.
+UNIT_FACTOR = 10.0
 
 
 def make_stack(
@@ -73,6 +75,26 @@ def checked_labels(labels: frozenset[int] | None) -> None:
         )
     if not labels or min(labels) < 1:
         raise InvalidParameter("label must name at least one value, and positive integers only", part="label")
+
+
+def require_length(stacks: Sequence[MaskStack], longest_mm: float) -> None:
+    """Refuse an object so long that its voxels cannot be in mm.
+
+    Args:
+        longest_mm: that an object can be, the longest side of the model's box.
+
+    Raises:
+        InvalidMask: over `UNIT_FACTOR` times as long along an axis of its grid.
+    """
+    for stack in stacks:
+        low, high = index_box(stack.foreground)
+        length_mm = float(((high - low + 1) * stack.grid.spacing).max())
+        if length_mm > UNIT_FACTOR * longest_mm:
+            raise InvalidMask(
+                f"{stack.part} holds an object {length_mm:.0f} mm long, and the model's are at most "
+                f"{longest_mm:.0f} mm; a mask of one of them, whose voxel spacing is in mm, is accepted",
+                part=stack.part,
+            )
 
 
 def checked_affine(part: str, affine: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.dicom_parts import file_bytes, mr_series, seg_of
-from tests.service_parts import app_for, image, mask_bytes, running, sparse_ellipsoid
+from tests.service_parts import app_for, image, mask_bytes, problem, running, sparse_ellipsoid
 
 RECONSTRUCTIONS = "/v1/reconstructions"
 CUT = "beyond the grid of the first mask"
@@ -57,3 +57,11 @@ def test_a_guessed_orientation_is_told_before_and_after(client):
     assert [sentence.partition(" ")[0] for sentence in told] == ["mask[1]"]
     before = client.post("/v1/planes", files=[("mask", ("m", mask)) for mask in (mask_bytes(), bare.to_bytes())])
     assert before.json()["warnings"] == told
+
+
+def test_voxels_in_another_unit_are_blamed_on_the_mask(client):
+    metres = nib.Nifti1Image.from_bytes(mask_bytes())
+    metres.header.set_xyzt_units("meter")
+    told = problem(client.post(RECONSTRUCTIONS, files={"mask": ("m", metres.to_bytes())}), 422)
+    assert (told["type"], told["part"]) == ("urn:morphoflow:problem:invalid-mask", "mask[0]")
+    assert "in mm" in told["detail"]

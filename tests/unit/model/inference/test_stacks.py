@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from model.errors import InvalidGeometry, InvalidMask, InvalidParameter
-from model.inference.stacks import make_stack
+from model.inference.stacks import UNIT_FACTOR, make_stack, require_length
 
 AFFINE = np.diag([1.0, 2.0, 3.0, 1.0])
 
@@ -132,3 +132,15 @@ def test_the_affine_passed_in_stays_as_it_is():
     stack = make_stack("mask[0]", values_with(1), affine)
     affine[0, 3] = 77.0
     assert stack.grid.affine[0, 3] == 0.0
+
+
+@given(st.floats(0.01, 100.0), st.integers(0, 2), st.integers(1, 4))
+def test_an_object_may_be_so_many_times_as_long_as_the_models(spacing, axis, count):
+    values = np.zeros((4, 4, 4), np.uint8)
+    np.moveaxis(values, axis, 0)[:count, 0, 0] = 1
+    stack = make_stack("mask[1]", values, np.diag([spacing, spacing, spacing, 1.0]))
+    longest_mm = count * spacing / UNIT_FACTOR
+    require_length([stack], 1.001 * longest_mm)
+    with pytest.raises(InvalidMask, match=r"mask\[1\] holds an object .* mm long") as refused:
+        require_length([stack], 0.999 * longest_mm)
+    assert refused.value.part == "mask[1]"
