@@ -4,12 +4,14 @@ import numpy as np
 from jaxtyping import Float
 
 from model.geometry import Grid
-from model.inference.mesh import Mesh
+from model.inference.mesh import Mesh, volume_ml
 
 #: From a voxel's centre to its border (voxels).
 HALF = 0.5
 #: How far the surface may leave a grid's outermost voxels before maps on it count as cut (voxels).
 CUT_VOXELS = 1.0
+#: A mesh whose volume differs from the figure by more than this share of it is coarse.
+COARSE_SHARE = 0.02
 
 
 def grid_cautions(mesh: Mesh, grid: Grid) -> tuple[str, ...]:
@@ -24,6 +26,20 @@ def grid_cautions(mesh: Mesh, grid: Grid) -> tuple[str, ...]:
         f"{percent} % of the body, those at a spacing_mm all of it."
     )
     return (sentence,)
+
+
+def coarse_cautions(mesh: Mesh, step_mm: float | None, figure_ml: float, judged_mm: float) -> tuple[str, ...]:
+    """What to tell when the mesh at a step that was asked for does not enclose the volume that is told.
+
+    Args:
+        step_mm: of the mesh; None where none was asked for.
+        figure_ml: the volume that is told.
+        judged_mm: step of the surface that figures are taken from.
+    """
+    enclosed = volume_ml(mesh)
+    if step_mm is None or step_mm <= judged_mm or abs(enclosed - figure_ml) <= COARSE_SHARE * figure_ml:
+        return ()
+    return (f"The mesh at {step_mm:g} mm encloses {enclosed:.3g} mL; figures are measured at {judged_mm:g} mm.",)
 
 
 def share_within(mesh: Mesh, grid: Grid) -> float:

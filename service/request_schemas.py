@@ -55,7 +55,9 @@ class ReconstructionForm(_Closed):
     uncertainty: Literal["laplace", "ensemble", "none"] = Field("laplace", description="how uncertainty is found")
     mirror: Literal["auto", "never", "always"] = Field("never", description="whether left and right are exchanged")
     resolution_mm: SpacingMm | None = Field(
-        None, description="grid step of the surface (mm); the model's when left out"
+        None,
+        description="grid step of the surface (mm); the model's when left out. Figures of the summary are measured at "
+        "the model's step where this one is coarser",
     )
     seed: Seed = 0
     fidelity: float | None = Field(

@@ -26,6 +26,7 @@ from model.inference.stacks import require_length
 from model.inference.surface import covering_grid, require_step
 from model.inference.uncertainty import ShapeState, voxel_entropy
 from model.interruption import Check, interruptible, unchecked
+from service.cautions import coarse_cautions
 from service.errors import NotComputed
 from service.ports import Catalogue, ModeSource, Outcome
 
@@ -43,7 +44,7 @@ def reconstruct(
 ) -> Outcome:
     """Reconstruct the object of the stacks; the first one's grid is the input's grid.
 
-    What the stacks' notes say is among the warnings.
+    What the stacks' notes say is among the warnings, and whether the mesh is too coarse for the figures.
 
     Args:
         max_voxels: of the grid in which the surface is looked for; any number when None.
@@ -56,7 +57,9 @@ def reconstruct(
     require_length(stacks, farthest_mm(model))
     reconstruction = infer(interruptible(model, check), stacks, options, watch, max_voxels)
     manifest = model.manifest
-    told = replace(reconstruction, warnings=(*reconstruction.warnings, *notes_of(stacks)))
+    figure_ml, judged_mm = reconstruction.volume_ml.value, manifest.resolution_mm
+    coarse = coarse_cautions(reconstruction.mesh, options.resolution_mm, figure_ml, judged_mm)
+    told = replace(reconstruction, warnings=(*reconstruction.warnings, *notes_of(stacks), *coarse))
     return Outcome(manifest.name, manifest.version, model.digest, options, stacks[0].grid, told)
 
 

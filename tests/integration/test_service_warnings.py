@@ -65,3 +65,12 @@ def test_voxels_in_another_unit_are_blamed_on_the_mask(client):
     told = problem(client.post(RECONSTRUCTIONS, files={"mask": ("m", metres.to_bytes())}), 422)
     assert (told["type"], told["part"]) == ("urn:morphoflow:problem:invalid-mask", "mask[0]")
     assert "in mm" in told["detail"]
+
+
+@pytest.mark.parametrize(("step_mm", "told"), [(1.0, False), (1.1, False), (6.0, True)])
+def test_figures_do_not_depend_on_a_coarse_step(client, step_mm, told):
+    plain, found = (
+        reconstructed(client, mask_bytes(), uncertainty="none", **form) for form in ({}, {"resolution_mm": step_mm})
+    )
+    assert found["volume_ml"]["value"] == pytest.approx(plain["volume_ml"]["value"], rel=1e-3)
+    assert bool(warned(found, "figures are measured at")) is told

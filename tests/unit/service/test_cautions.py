@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from model.geometry import Grid
-from model.inference.mesh import mesh_of
-from service.cautions import grid_cautions, share_within
+from model.inference.mesh import mesh_of, volume_ml
+from service.cautions import COARSE_SHARE, coarse_cautions, grid_cautions, share_within
 
 RADIUS = 10.0
 
@@ -70,3 +70,17 @@ def test_how_far_and_how_much_is_told():
     assert "79 % of the body" in sentence
     (all_gone,) = grid_cautions(ball(), grid_from((20.0, 20.0, 20.0), (25.0, 25.0, 25.0)))
     assert "0 % of the body" in all_gone
+
+
+@given(st.floats(0.5, 1.5), st.floats(0.25, 10.0), st.floats(0.5, 2.0))
+def test_a_mesh_that_encloses_another_volume_than_is_told_is_told_of(factor, step_mm, judged_mm):
+    figure_ml = factor * volume_ml(ball())
+    differs = step_mm > judged_mm and abs(1 / factor - 1) > COARSE_SHARE
+    assert bool(coarse_cautions(ball(), step_mm, figure_ml, judged_mm)) is differs
+    assert coarse_cautions(ball(), None, figure_ml, judged_mm) == ()
+
+
+def test_both_volumes_and_steps_are_told():
+    assert coarse_cautions(ball(), 4.0, 5.0, 1.0) == (
+        "The mesh at 4 mm encloses 4.18 mL; figures are measured at 1 mm.",
+    )
