@@ -2,7 +2,7 @@
 
 Each plane is a stack of its own: one slice of (a, b, 1) voxels at the mask's finest spacing, with its own affine.
 Normals are uniform on the sphere, offsets uniform over the object's extent along the normal; planes that miss the
-object are drawn anew. A drawing of more planes holds those of a drawing of fewer.
+object, or hardly touch it, are drawn anew. A drawing of more planes holds those of a drawing of fewer.
 """
 
 import hashlib
@@ -12,13 +12,17 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
+from model.errors import CohortError
 from model.geometry import Grid
 from model.inference.observations import MaskStack, Plane
 from training.cohorts.cohort import Case
-from training.sparsify import Drawing
+from training.sparsify import Drawing, body_axes
 
-#: Least area (mm^2) of a section that counts as holding the object.
-LEAST_AREA_MM2 = 4.0
+#: Least area (mm^2) of a section that counts as holding the object; of a small object, this share of its largest axial
+#: section.
+LEAST_AREA_MM2, LEAST_SHARE = 4.0, 0.1
+#: Planes that are tried, at most, for one that holds the object.
+TRIES = 1000
 #: Voxels of a section are foreground from this interpolated occupancy on.
 OCCUPIED = 0.5
 
@@ -36,20 +40,37 @@ def in_one_stack(drawing: Drawing) -> SliceStacks:
     return SliceStacks((drawing.stack,), drawing.planes)
 
 
-def random_planes(case: Case, count: int, seed: int = 0) -> SliceStacks:
-    """The first planes of a case: a pure function of its name, its mask and the seed."""
+def random_planes(case: Case, count: int, seed: int = 0, *, tries: int = TRIES) -> SliceStacks:
+    """The first planes of a case: a pure function of its name, its mask and the seed.
+
+    Raises:
+        CohortError: none of so many tries for a plane holds the object; names the case.
+    """
     rng = _stream(case.name, seed)
     world = case.grid.to_world(np.argwhere(case.mask).astype(float))
-    stacks: list[MaskStack] = []
-    while len(stacks) < count:
+    stacks = tuple(_holding(case, world, rng, tries, f"mask[{number}]") for number in range(count))
+    return SliceStacks(stacks, tuple(Plane(number, 2, 0) for number in range(count)))
+
+
+def _holding(case: Case, world: Float[np.ndarray, "n 3"], rng: np.random.Generator, tries: int, part: str) -> MaskStack:
+    """The next random plane that holds the object, whose voxels lie at some points of the world."""
+    least = least_area(case)
+    for _ in range(tries):
         normal = _direction(rng)
         reach = world @ normal
-        offset = float(rng.uniform(reach.min(), reach.max()))
-        stack = section(case, normal, offset, f"mask[{len(stacks)}]")
-        area = stack.foreground.sum() * float(np.prod(stack.grid.spacing[:2]))
-        if area >= LEAST_AREA_MM2:
-            stacks.append(stack)
-    return SliceStacks(tuple(stacks), tuple(Plane(number, 2, 0) for number in range(count)))
+        stack = section(case, normal, float(rng.uniform(reach.min(), reach.max())), part)
+        if stack.foreground.sum() * float(np.prod(stack.grid.spacing[:2])) >= least:
+            return stack
+    raise CohortError(
+        f"{case.name}: hardly any plane shows {least:.2g} mm^2 of it; an object of more voxels across is accepted."
+    )
+
+
+def least_area(case: Case) -> float:
+    """Area (mm^2) of a section from which on it counts as holding the object."""
+    axial = body_axes(case.grid)[2]
+    voxels = np.moveaxis(case.mask, axial, 0).sum(axis=(1, 2)).max()
+    return min(LEAST_AREA_MM2, LEAST_SHARE * float(voxels * np.delete(case.grid.spacing, axial).prod()))
 
 
 def section(case: Case, normal: Float[np.ndarray, "3"], offset_mm: float, part: str) -> MaskStack:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from model.errors import CohortError
 from model.inference.mask_stack import MaskStack
 from training.cohorts.cohort import Case
 from training.oblique import SliceStacks, in_one_stack, random_planes
@@ -52,8 +53,11 @@ def _thick(found: Window, rng: np.random.Generator) -> SliceStacks:
 
 
 def _oblique(found: Window, rng: np.random.Generator) -> SliceStacks:
-    count = int(rng.integers(PLANES[0], PLANES[1] + 1))
-    return random_planes(Case("", "", "train", found.mask, found.grid), count, int(rng.integers(1 << 31)))
+    count, seed = int(rng.integers(PLANES[0], PLANES[1] + 1)), int(rng.integers(1 << 31))
+    try:
+        return random_planes(Case("", "", "train", found.mask, found.grid), count, seed)
+    except CohortError:  # such a thin object that hardly any plane holds it
+        return _largest(found, rng)
 
 
 def _known(stack: MaskStack, found: Window) -> MaskStack:

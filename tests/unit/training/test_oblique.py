@@ -1,13 +1,16 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from model.errors import CohortError
 from model.geometry import Grid
 from model.inference.observations import find_planes
 from tests.analytic_shapes import Ellipsoid
 from training.cohorts import Case
-from training.oblique import LEAST_AREA_MM2, random_planes, section
+from training.oblique import LEAST_AREA_MM2, least_area, random_planes, section
 
 RADIUS = 12.0
 CENTRE = np.array([1.2, -0.7, 0.4])
@@ -66,6 +69,24 @@ def test_planes_hold_the_object_and_are_taken_by_inference(count):
     assert np.unique(normals.round(6), axis=0).shape[0] == count
     if count == 2:
         assert find_planes(drawing.stacks, drawing.planes) == drawing.planes
+
+
+@pytest.mark.parametrize("size", [0.05, 0.1, 0.3])
+def test_planes_of_small_structures_hold_a_tenth_of_their_section(size):
+    case = ball()
+    small = replace(case, grid=Grid(case.grid.shape, np.diag([size] * 3 + [1.0]) @ case.grid.affine))
+    largest = case.mask.sum(axis=(0, 1)).max() * size**2
+    assert least_area(small) == pytest.approx(min(LEAST_AREA_MM2, 0.1 * largest))
+    areas = [stack.foreground.sum() * size**2 for stack in random_planes(small, 4).stacks]
+    assert min(areas) >= least_area(small) - 1e-9
+
+
+def test_what_planes_miss_is_refused_by_name():
+    mask = np.zeros((30, 30, 30), bool)
+    mask[[2, 27], [2, 27], [2, 27]] = True
+    grains = Case("grains", "grains", "test", mask, Grid(mask.shape, np.eye(4)))
+    with pytest.raises(CohortError, match="grains: hardly any plane"):
+        random_planes(grains, 2, tries=3)
 
 
 def test_more_planes_hold_the_fewer_and_another_name_has_other_ones():
