@@ -86,7 +86,16 @@ class GivenUp(ServiceError):
 
 
 class NotReady(ServiceError):
-    """A job without a result: not done yet, failed or cancelled."""
+    """A job without a result: not done yet, failed or cancelled.
+
+    Args:
+        message: one sentence.
+        cause: the kind of problem that a job failed of; None otherwise.
+    """
+
+    def __init__(self, message: str, cause: "Kind | None" = None) -> None:
+        super().__init__(message)
+        self.cause = cause
 
 
 class UnknownJob(NotFound):

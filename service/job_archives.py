@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from model.errors import InvalidParameter, TooLarge
+from model.errors import InputError, InvalidParameter, TooLarge, UnreadableImage
 
 #: Files of an archive or a folder with these endings are masks; others are left out.
 MASK_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".mha", ".mhd", ".dcm")
@@ -40,7 +40,7 @@ class ArchivedMask:
 
     name: str
     content: bytes = b""
-    problem: str | None = None
+    problem: InputError | None = None
 
 
 def open_archive(archive: BinaryIO) -> zipfile.ZipFile:
@@ -108,18 +108,22 @@ def _read(opened: zipfile.ZipFile, info: zipfile.ZipInfo, limits: ArchiveLimits)
             while len(content) <= limits.max_mask_bytes and (piece := member.read(_CHUNK)):
                 content += piece
     except _DAMAGED:
-        return ArchivedMask(info.filename, problem="The mask is damaged in the archive; pack it anew.")
+        damaged = UnreadableImage("The mask is damaged in the archive; pack it anew.", part="mask")
+        return ArchivedMask(info.filename, problem=damaged)
     return ArchivedMask(info.filename, bytes(content))
 
 
-def _refusal(info: zipfile.ZipInfo, limits: ArchiveLimits) -> str | None:
+def _refusal(info: zipfile.ZipInfo, limits: ArchiveLimits) -> InputError | None:
     """Why a mask is not even unpacked; None when it is."""
     if info.file_size > limits.max_mask_bytes:
-        return f"The mask is larger than {limits.max_mask_bytes} bytes, the most that is accepted."
+        return TooLarge(
+            f"The mask is larger than {limits.max_mask_bytes} bytes, the most that is accepted.", part="mask"
+        )
     if info.flag_bits & _ENCRYPTED:
-        return "The mask is encrypted in the archive; a ZIP without password is accepted."
+        return UnreadableImage("The mask is encrypted in the archive; a ZIP without password is accepted.", part="mask")
     if info.compress_type not in _METHODS:
-        return "The mask is compressed in an unusual way; members of a ZIP must be stored or deflated."
+        unusual = "The mask is compressed in an unusual way; members of a ZIP must be stored or deflated."
+        return UnreadableImage(unusual, part="mask")
     return None
 
 

@@ -7,6 +7,7 @@ from enum import StrEnum
 from typing import Any, BinaryIO, Protocol
 
 from model.interruption import Check
+from service.errors import Kind
 
 __all__ = [
     "BlobStore",
@@ -46,6 +47,7 @@ class JobStatus:
         id: random, or a pure function of kind and idempotency key.
         done, total: items; the total is 0 until it is known.
         problem: sentence that says why it failed.
+        problem_kind: of that problem; None where there is none, or its kind is not known.
         result: what the kind's `follow` returned, when it is done.
     """
 
@@ -59,6 +61,7 @@ class JobStatus:
     done: int
     total: int
     problem: str | None = None
+    problem_kind: Kind | None = None
     result: Record | None = None
 
     def remaining_s(self, now: datetime) -> float | None:

@@ -24,5 +24,7 @@ def job_summary(status: JobStatus, prefix: str = "", now: datetime | None = None
         total=status.total,
         remaining_s=None if remaining is None else round(remaining, 1),
         problem=status.problem,
+        problem_type=None if status.problem_kind is None else status.problem_kind.type,
+        problem_status=None if status.problem_kind is None else status.problem_kind.status,
         links=JobLinks(self=place, events=f"{place}/events", result=result if is_there else None),
     )

@@ -102,4 +102,8 @@ class JobSummary(BaseModel):
     total: int = Field(description="items in all; 0 until it is known")
     remaining_s: float | None = Field(description="estimated time to its end (s); null while nothing is known")
     problem: str | None = Field(description="why it failed, or that what it made is gone")
+    problem_type: str | None = Field(
+        description="stable name of the kind of that problem, as a request that is waited for would be answered with"
+    )
+    problem_status: int | None = Field(description="HTTP status of that kind")
     links: JobLinks

@@ -256,3 +256,5 @@ class Problem(BaseModel):
     detail: str = Field(description="a sentence that names the offending part and what would be accepted")
     part: str | None = Field(None, description="the offending part, for example mask[1] or resolution_mm")
     request_id: str | None = Field(None, description="the request in the service's logs")
+    problem_type: str | None = Field(None, description="of a job that failed: `type` of what went wrong")
+    problem_status: int | None = Field(None, description="of a job that failed: HTTP status of that type")

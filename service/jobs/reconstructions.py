@@ -5,6 +5,7 @@ import json
 
 from model.errors import InputError, InvalidParameter
 from service import use_cases
+from service.errors import kind_of
 from service.job_archives import MASK_SUFFIXES, masks_in
 from service.job_files import JobFiles
 from service.job_ports import Check, JobKind, JobRun, Record
@@ -58,7 +59,7 @@ def _unpack(tools: JobTools, item: Record, check: Check) -> Record:
         if mask.problem is None:
             files.put_input(len(names), mask.content)
         else:
-            files.put_item(len(names) - 1, {}, {"mask": mask.name, "problem": mask.problem})
+            files.put_item(len(names) - 1, {}, _refused(mask.name, mask.problem))
     if not names:
         raise InvalidParameter(
             f"The archive must hold masks; they end with {', '.join(MASK_SUFFIXES)}.", part="archive"
@@ -79,10 +80,15 @@ def _reconstruct_one(tools: JobTools, item: Record, check: Check) -> Record:
     try:
         outcome = _reconstruct(tools, item, [files.input(number + 1)], check)
     except InputError as error:
-        files.put_item(number, {}, {"mask": name, "problem": str(error)})
+        files.put_item(number, {}, _refused(name, error))
     else:
         _put(tools, files, number, name, item["format"], outcome)
     return {"made": 1}
+
+
+def _refused(name: str, error: InputError) -> Record:
+    """The entry of a mask at fault."""
+    return {"mask": name, "problem": str(error), "problem_type": kind_of(error).type}
 
 
 def _put(tools: JobTools, files: JobFiles, number: int, name: str, format: str, outcome: Outcome) -> None:

@@ -12,7 +12,7 @@ from zipstream import ZipStream  # type: ignore[import-untyped]
 
 from model.inference.surface import require_step
 from service import use_cases
-from service.errors import Cancelled, NotReady, Overloaded, UnknownJob, UnknownResult
+from service.errors import KINDS, Cancelled, NotReady, Overloaded, UnknownJob, UnknownResult
 from service.job_files import JobFiles, remove_job
 from service.job_ports import JobState, JobStatus
 from service.job_presentation import job_summary
@@ -126,7 +126,7 @@ def _status(services: Services, identifier: str) -> JobStatus:
     """What is known of a job; one whose result is kept by itself, and is gone, says so."""
     status = services.jobs.status(identifier)
     is_kept = status.kind != RECONSTRUCTION_JOB or status.state is not JobState.DONE or services.store.has(identifier)
-    return status if is_kept else replace(status, result=None, problem=RESULT_GONE)
+    return status if is_kept else replace(status, result=None, problem=RESULT_GONE, problem_kind=KINDS[UnknownResult])
 
 
 async def end_job(identifier: Identifier, request: Request, services: WithServices) -> Response:
@@ -169,7 +169,7 @@ async def read_result(identifier: Identifier, request: Request, services: WithSe
         raise UnknownResult(RESULT_GONE)
     if status.state is not JobState.DONE or status.result is None:
         why = f" {status.problem}" if status.problem else ""
-        raise NotReady(f"The job has no result: its state is {status.state.value}.{why}")
+        raise NotReady(f"The job has no result: its state is {status.state.value}.{why}", status.problem_kind)
     if status.kind == RECONSTRUCTION_JOB:
         return RedirectResponse(address(request, f"/v1/reconstructions/{identifier}"), 303)
     members = result_members(JobFiles(services.blobs, identifier), status.kind, status.result["count"])
@@ -203,7 +203,7 @@ async def _looked_at(services: Services, status: JobStatus) -> JobStatus:
     except Overloaded:  # the database is away; the next look may find it
         return status
     except UnknownJob:
-        return replace(status, state=JobState.CANCELLED, problem="The job was deleted.")
+        return replace(status, state=JobState.CANCELLED, problem="The job was deleted.", problem_kind=KINDS[UnknownJob])
 
 
 def _zip(members: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:

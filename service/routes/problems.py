@@ -11,7 +11,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Match, Mount
 
 from model.errors import InputError, InvalidParameter, MorphoFlowError, NotFound, TooLarge
-from service.errors import PROTOCOL_KINDS, HelperLost, Kind, Overloaded, Unauthorised, kind_of
+from service.errors import PROTOCOL_KINDS, HelperLost, Kind, NotReady, Overloaded, Unauthorised, kind_of
 from service.schemas import Problem
 
 #: What the reader of multipart bodies says of one beyond its own limits.
@@ -47,11 +47,24 @@ class NamedNotFound(HTTPException):
 
 
 def problem_response(
-    kind: Kind, detail: str, *, request_id: str | None, part: str | None = None, headers: dict[str, str] | None = None
+    kind: Kind,
+    detail: str,
+    *,
+    request_id: str | None,
+    part: str | None = None,
+    headers: dict[str, str] | None = None,
+    cause: Kind | None = None,
 ) -> Response:
-    """A problem as a response."""
+    """A problem as a response; `cause` is the kind of problem that a job failed of."""
     problem = Problem(
-        type=kind.type, title=kind.title, status=kind.status, detail=detail, part=part, request_id=request_id
+        type=kind.type,
+        title=kind.title,
+        status=kind.status,
+        detail=detail,
+        part=part,
+        request_id=request_id,
+        problem_type=None if cause is None else cause.type,
+        problem_status=None if cause is None else cause.status,
     )
     content = problem.model_dump(exclude_none=True)
     return JSONResponse(content, kind.status, headers=headers, media_type=PROBLEM_MEDIA_TYPE)
@@ -64,7 +77,9 @@ def respond_to(
     kind = kind_of(error)
     detail = str(error) if kind.status != 500 else PROTOCOL_SENTENCES[500]
     part = error.part if isinstance(error, InputError) else part
-    return problem_response(kind, detail, request_id=request_id, part=part, headers=_headers(error, retry_after_s))
+    cause = error.cause if isinstance(error, NotReady) else None
+    headers = _headers(error, retry_after_s)
+    return problem_response(kind, detail, request_id=request_id, part=part, headers=headers, cause=cause)
 
 
 def install_handlers(app: FastAPI, retry_after_s: int) -> None:

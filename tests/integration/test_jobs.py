@@ -69,7 +69,8 @@ def test_each_mask_of_an_archive_is_reconstructed_and_one_at_fault_stops_no_othe
         *(f"masks/{name}.nii" for name in "abc"),
         "masks/d.dcm",
     ]
-    assert "problem" in second
+    assert "mask[0]" in second["problem"]
+    assert second["problem_type"] == "urn:morphoflow:problem:unreadable-image"
     assert (first["summary"]["space"], fourth["summary"]["space"]) == ("RAS", "LPS")
     assert b"comment space LPS" in files[fourth["file"]]
     assert "space" not in json.loads(files["manifest.json"])
@@ -87,6 +88,7 @@ def test_a_reconstruction_may_be_asked_for_without_waiting(client):
     summary = ended(client, accepted.headers["location"])
     result = client.get(f"{summary['links']['self']}/result", follow_redirects=True).json()
     assert result["links"]["self"] == summary["links"]["result"]
+    assert (summary["problem"], summary["problem_type"], summary["problem_status"]) == (None, None, None)
     assert result["volume_ml"] == waited["volume_ml"]
 
 
@@ -98,6 +100,9 @@ def test_an_input_at_fault_fails_the_job_with_its_sentence(client):
     refused = client.get(f"{accepted.headers['location']}/result")
     assert refused.status_code == 409
     assert refused.json()["detail"].endswith(summary["problem"])
+    waited = problem(client.post("/v1/reconstructions", files=mask_parts(b"no")), 415)
+    for told in (summary, refused.json()):
+        assert (told["problem_type"], told["problem_status"]) == (waited["type"], waited["status"])
 
 
 def test_the_same_key_leads_to_the_same_job_and_another_request_is_refused(client):
@@ -172,7 +177,11 @@ def test_a_damaged_mask_of_an_archive_is_an_entry_and_stops_no_other(client):
     assert (summary["state"], summary["done"]) == ("done", 2)
     first, second = json.loads(members(client.get(summary["links"]["result"]))["manifest.json"])["reconstructions"]
     assert first["summary"]["fit"]["converged"]
-    assert second == {"mask": "masks/b.nii", "problem": "The mask is damaged in the archive; pack it anew."}
+    assert second == {
+        "mask": "masks/b.nii",
+        "problem": "The mask is damaged in the archive; pack it anew.",
+        "problem_type": "urn:morphoflow:problem:unreadable-image",
+    }
 
 
 @pytest.mark.parametrize(
@@ -210,6 +219,7 @@ def test_a_job_whose_result_was_deleted_says_so_and_leads_nowhere(client):
     assert (summary["state"], summary["links"]["result"]) == ("done", None)
     assert "deleted" in summary["problem"]
     told = problem(client.get(f"{place}/result", follow_redirects=False), 404)
+    assert (summary["problem_type"], summary["problem_status"]) == (told["type"], told["status"])
     assert (told["type"], told["detail"]) == ("urn:morphoflow:problem:unknown-result", summary["problem"])
     assert client.delete(place).status_code == 204
 

@@ -29,7 +29,7 @@ from service.adapters.jobs.database import (
     prepare,
     queue_of,
 )
-from service.errors import Overloaded, StoreFull, UnknownJob
+from service.errors import KINDS, PROTOCOL_KINDS, Kind, Overloaded, StoreFull, UnknownJob
 from service.full_disks import is_full
 from service.identifiers import is_identifier
 from service.job_ports import JobState, JobStatus, Record
@@ -51,6 +51,7 @@ _STATES = {
 }
 #: Jobs of one query.
 _ASKED_FOR = 500
+_KINDS = {error.__name__: kind for error, kind in KINDS.items()}
 _FAULT = "The job met a fault of the service; its logs hold more under the job's identifier."
 
 
@@ -252,7 +253,7 @@ def job_status(workflow: WorkflowStatus, progress: Mapping[str, Any]) -> JobStat
     if state is JobState.QUEUED and progress:
         state = JobState.RUNNING  # waits for another worker to go on
     answer = workflow.output if isinstance(workflow.output, dict) else {}
-    problem = answer.get("problem") if state is JobState.DONE else _FAULT if state is JobState.FAILED else None
+    problem, problem_kind = _problem(state, answer)
     kind, argument = workflow.input["args"] if workflow.input else ("", {})
     return JobStatus(
         id=workflow.workflow_id,
@@ -265,8 +266,18 @@ def job_status(workflow: WorkflowStatus, progress: Mapping[str, Any]) -> JobStat
         done=progress.get("done", 0),
         total=progress.get("total", 0),
         problem=problem,
+        problem_kind=problem_kind,
         result=answer.get("result"),
     )
+
+
+def _problem(state: JobState, answer: Mapping[str, Any]) -> tuple[str | None, Kind | None]:
+    """Why a job failed, and of which kind that is; records of earlier releases do not say the latter."""
+    if state is JobState.FAILED:
+        return _FAULT, PROTOCOL_KINDS[500]
+    if state is not JobState.DONE:
+        return None, None
+    return answer.get("problem"), _KINDS.get(answer.get("error", ""))
 
 
 def _moment(epoch_ms: int | None) -> datetime | None:

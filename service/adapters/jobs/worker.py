@@ -136,11 +136,11 @@ def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: Busy, log: Log
         try:
             return {"result": dict(kinds[kind].follow(run, argument))}
         except MorphoFlowError as error:
-            return {"problem": str(error)}
+            return {"problem": str(error), "error": type(error).__name__}
         except PortableWorkflowError as error:
             if error.name not in _PROJECT_ERRORS:
                 raise
-            return {"problem": error.message}
+            return {"problem": error.message, "error": error.name}
 
 
 def _tried_again(name: str) -> StepOptions:

@@ -19,7 +19,7 @@ from model.errors import InvalidMask
 from service.adapters.jobs.client import DbosJobs
 from service.adapters.jobs.database import Leases, bounded, is_made
 from service.adapters.jobs.worker import WorkerOptions, running_worker
-from service.errors import Overloaded, StoreFull, UnknownJob
+from service.errors import KINDS, Overloaded, StoreFull, UnknownJob
 from service.job_ports import JobKind, JobState, JobStatus
 from service.observability import make_log
 from tests.small_disks import fill, small_disk
@@ -88,6 +88,7 @@ def test_a_storage_that_refuses_for_a_while_is_tried_again_and_an_input_at_fault
         status = awaited(jobs, second)
     assert seen.count(1) == 2
     assert (status.state, status.problem) == (JobState.FAILED, "The mask has no foreground.")
+    assert status.problem_kind is KINDS[InvalidMask]
     jobs.close()
 
 
