@@ -1,7 +1,10 @@
-"""What to expect of few shapes: sentences for the caller, before the work begins."""
+"""What to expect of few or small shapes: sentences for the caller, before the work begins."""
+
+import numpy as np
 
 from model.errors import InvalidParameter
 from training.cohorts.cohort import Cohort
+from training.cohorts.inspect import extent_mm
 
 #: Training shapes below which a model cannot be made, and those below which it has seen little.
 LEAST_SHAPES, FEW_SHAPES = 2, 10
@@ -9,6 +12,8 @@ LEAST_SHAPES, FEW_SHAPES = 2, 10
 FEW_VALIDATION = 4
 #: Training shapes below which a completion network mostly learns them by heart.
 FEW_COMPLETED = 50
+#: Training shapes shorter than this are small beside the distances of the method (mm).
+SMALL_MM = 15.0
 
 
 def of_training(cohort: Cohort) -> str:
@@ -24,11 +29,25 @@ def of_training(cohort: Cohort) -> str:
             "accepted.",
             part="cohort",
         )
+    return "; ".join(words for words in (_few(count), _small(cohort)) if words)
+
+
+def _few(count: int) -> str:
     if count >= FEW_SHAPES:
         return ""
     return (
         f"{count} training shapes are few: reconstructions of other shapes will look like these; twenty are enough to "
         "begin with"
+    )
+
+
+def _small(cohort: Cohort) -> str:
+    length = float(np.median([extent_mm(case.mask, case.grid) for case in cohort.train]))
+    if length >= SMALL_MM:
+        return ""
+    return (
+        f"shapes of {length:.3g} mm are small: the method's distances, which are in mm, suit objects from about 20 mm; "
+        "masks with a spacing scaled up by one factor for all come out better"
     )
 
 

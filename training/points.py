@@ -2,7 +2,8 @@
 
 Each mask is moved so that the centroid of its foreground is the origin: the placement of training masks is
 taken as known, while orientation and size stay as they are. Everything outside the crop is background, except
-beyond a face of the crop that cuts the object off: nothing is said there.
+beyond a face of the crop that cuts the object off: nothing is said there. Distances suit organs; those of an object
+shorter than `SMALL_MM` shrink along with it.
 """
 
 from collections.abc import Sequence
@@ -15,14 +16,16 @@ from scipy.ndimage import distance_transform_edt
 
 from model.geometry import Grid
 from training.cohorts.cohort import Case
-from training.cohorts.inspect import bounding_box, cut_faces, touches_border
+from training.cohorts.inspect import bounding_box, cut_faces, extent_mm, touches_border
 from training.samples import ShapePoints
 from training.sparsify import Drawing, Regime, for_training
 
-#: Points within this distance of the contour are near (mm).
-BAND_MM = 3.0
+#: Points within this distance of the contour are near (mm), or within so many voxels where they are larger.
+BAND_MM, BAND_VOXELS = 3.0, 1.5
 #: Background voxels around the object's box (mm).
 MARGIN_MM = 8.0
+#: Objects shorter than this have a narrower band and margin.
+SMALL_MM = 20.0
 #: Random background points beyond that margin, a shape.
 FAR_COVER = 2000
 #: Points kept for all shapes together, and for one.
@@ -52,10 +55,12 @@ class Window:
 def window(case: Case, margin_mm: float = MARGIN_MM, *, cut_is_end: bool = False) -> Window:
     """Crop to the object with a margin of background, or of unknown voxels where the crop cuts it off.
 
-    With ``cut_is_end`` the object ends at the crop by definition, as a bone cut to a length does.
+    Args:
+        margin_mm: of objects that are not small (`reduction`).
+        cut_is_end: the object ends at the crop by definition, as a bone cut to a length does.
     """
     box = bounding_box(case.mask)
-    pad = np.ceil(margin_mm / case.grid.spacing).astype(int)
+    pad = np.ceil(margin_mm * reduction(case.mask, case.grid) / case.grid.spacing).astype(int)
     widths = [(int(width), int(width)) for width in pad]
     mask = np.pad(case.mask[box], widths)
     unknown = np.zeros(mask.shape, bool)
@@ -66,6 +71,11 @@ def window(case: Case, margin_mm: float = MARGIN_MM, *, cut_is_end: bool = False
     affine = case.grid.affine.astype(float).copy()
     affine[:3, 3] = case.grid.to_world(np.array([[side.start for side in box] - pad], float))[0]
     return Window(mask, Grid((mask.shape[0], mask.shape[1], mask.shape[2]), affine), unknown)
+
+
+def reduction(mask: Bool[np.ndarray, "i j k"], grid: Grid) -> float:
+    """Factor on distances of an object: 1 from `SMALL_MM` on, and its share of that below."""
+    return min(1.0, extent_mm(mask, grid) / SMALL_MM)
 
 
 def cohort_points(cases: Sequence[Case], regime: Regime, seed: int, threads: int = 1) -> list[ShapePoints]:
@@ -86,7 +96,7 @@ def cohort_points(cases: Sequence[Case], regime: Regime, seed: int, threads: int
 def shape_points(found: Window, regime: Regime, rng: np.random.Generator, limit: int) -> ShapePoints:
     """Points of one random drawing, at most ``limit`` and a thin cover of the far background."""
     drawing = for_training(found.mask, found.grid, regime, rng)
-    near = near_contour(drawing, regime)
+    near = near_contour(drawing, regime, BAND_MM * reduction(found.mask, found.grid))
     index = _kept(rng.permutation(np.argwhere(_known(drawing, found))), drawing.stack.foreground, limit)
     world = np.concatenate([drawing.stack.grid.to_world(index.astype(float)), _far_cover(found, rng)])
     at = tuple(index.T)
@@ -100,15 +110,18 @@ def shape_points(found: Window, regime: Regime, rng: np.random.Generator, limit:
 
 
 def near_contour(drawing: Drawing, regime: Regime, band_mm: float = BAND_MM) -> Bool[np.ndarray, "i j k"]:
-    """Voxels within the band around the contour: in space for dense masks, in the drawn planes otherwise."""
+    """Voxels within the band around the contour: in space for dense masks, in the drawn planes otherwise.
+
+    The band has `BAND_VOXELS` of the finer ones of those spacings at least.
+    """
     foreground, spacing = drawing.stack.foreground, drawing.stack.grid.spacing
     if regime == "dense":
-        return _distance(foreground, spacing) <= band_mm
+        return _within(foreground, spacing, band_mm)
     near = np.zeros(foreground.shape, bool)
     for plane in drawing.planes:
         section = np.moveaxis(foreground, plane.axis, 0)[plane.index]
         along = np.moveaxis(near, plane.axis, 0)
-        along[plane.index] |= _distance(section, np.delete(spacing, plane.axis)) <= band_mm
+        along[plane.index] |= _within(section, np.delete(spacing, plane.axis), band_mm)
     return near
 
 
@@ -116,6 +129,11 @@ def decoder_extent(points: Sequence[ShapePoints]) -> float:
     """Half size of a canonical cube that holds every training shape with room to spare (mm)."""
     reach = max(float(np.abs(shape.points[shape.labels]).max()) for shape in points)
     return float(np.ceil(EXTENT_FACTOR * reach))
+
+
+def _within(inside: Bool[np.ndarray, "*s"], spacing: Float[np.ndarray, "n"], band_mm: float) -> Bool[np.ndarray, "*s"]:
+    """Whether the nearest voxel of the other kind is near."""
+    return np.asarray(_distance(inside, spacing) <= max(band_mm, BAND_VOXELS * float(spacing.min())))
 
 
 def _distance(inside: Bool[np.ndarray, "*s"], spacing: Float[np.ndarray, "n"]) -> Float[np.ndarray, "*s"]:
@@ -130,7 +148,7 @@ def _known(drawing: Drawing, found: Window) -> Bool[np.ndarray, "i j k"]:
     """Voxels that the drawing tells of; those of the object too where all its slices stand beyond a cut."""
     known = drawing.annotated & ~_unknown_on(drawing.stack.grid, found)
     inside = drawing.stack.foreground
-    return known if (known & inside).any() else known | inside
+    return np.asarray(known if (known & inside).any() else known | inside)
 
 
 def _kept(index: Int[np.ndarray, "n 3"], inside: Bool[np.ndarray, "i j k"], limit: int) -> Int[np.ndarray, "m 3"]:

@@ -16,7 +16,7 @@ from training.cohorts.cohort import (
     nothing_left_error,
     refusal_error,
 )
-from training.cohorts.inspect import copies, findings_of, outliers, without_specks
+from training.cohorts.inspect import copies, findings_of, out_of_range, outliers, without_specks
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def assemble(
     """
     filled = [case for case in cases if case.mask.any()]
     empty = [Refusal(case.name, "it holds no foreground") for case in cases if not case.mask.any()]
-    found = _merged([*refused, *empty, *copies(filled), *outliers(filled)])
+    found = _merged([*refused, *empty, *out_of_range(filled), *copies(filled), *outliers(filled)])
     left_out = {refusal.name for refusal in found}
     kept = [_inspected(case) for case in filled if case.name not in left_out]
     if not any(case.split == "train" for case in kept):

@@ -1,6 +1,7 @@
 """What is wrong or peculiar with a mask, alone and beside its cohort.
 
-Refused: nothing in it, a copy of another case, a size or a voxel spacing that does not belong to the cohort.
+Refused: nothing in it, a copy of another case, a size that anatomy in mm has not, a size or a voxel spacing that does
+not belong to the cohort.
 Kept with a finding: specks, several large parts, an object that the crop cuts off, thick slices.
 """
 
@@ -20,6 +21,8 @@ SPECK_FRACTION = 0.05
 #: Share of neighbouring occupied slices that must be equal before a mask is said to come from thick slices:
 #: slices at least 1.4 times as thick as the grid's.
 THICK_SHARE = 0.3
+#: Extents that anatomy in mm has.
+EXTENT_RANGE_MM = (2.0, 2000.0)
 #: A case is an outlier beyond this many robust standard deviations (1.4826 MAD) of the logarithm.
 OUTLIER_LIMIT = 8.0
 #: Least robust standard deviation of log size, so that nothing within a factor of 2.2 is ever refused.
@@ -160,6 +163,25 @@ def voxel_digest(mask: Bool[np.ndarray, "i j k"]) -> str:
     return hashlib.sha256(repr(cropped.shape).encode() + np.packbits(cropped).tobytes()).hexdigest()
 
 
+def extent_mm(mask: Bool[np.ndarray, "i j k"], grid: Grid) -> float:
+    """Longest side (mm) of the smallest box of voxels around the foreground, which must not be empty."""
+    return float(_extent(mask, grid).max())
+
+
+def out_of_range(cases: Sequence[Case]) -> tuple[Refusal, ...]:
+    """Cases that are longer or shorter than anything in a body, as masks are whose voxels are given in metres."""
+    low, high = EXTENT_RANGE_MM
+    lengths = {case.name: extent_mm(case.mask, case.grid) for case in cases}
+    return tuple(
+        Refusal(
+            name,
+            f"the object is {length:.3g} mm long; {low:g} to {high:g} mm is accepted: are the voxels given in mm?",
+        )
+        for name, length in lengths.items()
+        if not low <= length <= high
+    )
+
+
 def outliers(cases: Sequence[Case]) -> tuple[Refusal, ...]:
     """Cases whose spacing, volume or extent lies far outside the rest of the cohort, with reasons in words."""
     if len(cases) < LEAST_CASES:
@@ -192,8 +214,12 @@ def _sorted_spacing(grid: Grid) -> Float[np.ndarray, "3"]:
 
 
 def _sorted_extent(case: Case) -> Float[np.ndarray, "3"]:
-    sizes = [side.stop - side.start for side in bounding_box(case.mask)]
-    return np.asarray(np.sort(np.array(sizes) * case.grid.spacing))
+    return np.asarray(np.sort(_extent(case.mask, case.grid)))
+
+
+def _extent(mask: Bool[np.ndarray, "i j k"], grid: Grid) -> Float[np.ndarray, "3"]:
+    sizes = [side.stop - side.start for side in bounding_box(mask)]
+    return np.array(sizes) * grid.spacing
 
 
 def _words(values: Float[np.ndarray, "m"]) -> str:

@@ -28,6 +28,7 @@ from model.geometry import Grid
 from training.cohorts.assemble import CohortOptions, assemble
 from training.cohorts.cohort import Cohort, Provenance
 from training.cohorts.folder import absent, read_cases, read_table
+from training.cohorts.inspect import EXTENT_RANGE_MM
 from training.cohorts.reading import MaskFile, stem
 from training.cohorts.voxelising import SpaceName, Voxelising
 
@@ -48,8 +49,6 @@ MOST_VOXELS = 100_000_000
 OFF_FACES = np.array([0.0061, 0.0083, 0.0047])
 #: A mesh of this share of a voxel more than a whole number of them is as wide as one more.
 WIDER = 0.51
-#: Extents that anatomy in mm has.
-EXTENT_RANGE_MM = (2.0, 2000.0)
 
 
 def read_meshes(folder: Path, options: CohortOptions, *, how: Voxelising = ONE_MM) -> Cohort:

@@ -114,6 +114,14 @@ class TestSplits:
         with pytest.raises(CohortError, match=r"1 person\(s\) stand in more than one split \(c0\)"):
             assemble("balls", cases, (), OWN, CohortOptions(validation_fraction=0.0))
 
+    @pytest.mark.parametrize("factor", [0.001, 1000.0])
+    def test_masks_in_another_unit_than_mm_are_refused_by_name(self, factor):
+        cases = [case(f"u{n}", ball(4.0 + 0.3 * n), spacing=factor) for n in range(3)]
+        with pytest.raises(CohortError, match=r"u0: the object is .* mm long; 2 to 2000 mm is accepted.*given in mm\?"):
+            assemble("balls", [*cases, *balls()], (), OWN, CohortOptions())
+        kept = assemble("balls", [*cases, *balls()], (), OWN, CohortOptions(skip_refused=True))
+        assert not {found.name for found in kept.cases} & {found.name for found in cases}
+
     def test_where_nothing_is_left_to_train_on_the_other_splits_are_counted(self):
         cases = [case(f"t{n}", ball(4.0 + 0.3 * n), split="test") for n in range(3)]
         with pytest.raises(CohortError, match=r"left to train on \(0 train, 0 validation, 3 test\)$"):

@@ -1,14 +1,18 @@
 """Errors and interrupts as a sentence and an exit status; what is told before the work."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 
 from model.errors import InvalidParameter
+from model.geometry import Grid
 from tests.ellipsoid_cohort import GRID, ellipsoids
 from training import console, expectations
 from training.cohorts import Case, Cohort, Provenance
+from training.cohorts.inspect import extent_mm
 from training.console import check_output, exit_status
 from training.interruption import Stopped
 
@@ -84,6 +88,14 @@ class TestExpectations:
     def test_few_shapes_are_told_of(self, told, few, enough):
         assert "few" in told(few)
         assert told(enough) == ""
+
+    def test_small_shapes_are_told_of(self):
+        usual = cohort(10, 0)
+        length = extent_mm(usual.train[0].mask, GRID)
+        for aim, told in ((0.9 * expectations.SMALL_MM, True), (1.1 * expectations.SMALL_MM, False)):
+            grid = Grid(GRID.shape, np.diag([aim / length] * 3 + [1.0]) @ GRID.affine)
+            shapes = tuple(replace(case, grid=grid) for case in usual.train)
+            assert ("spacing" in expectations.of_training(replace(usual, train=shapes))) is told
 
     def test_one_shape_makes_no_model(self):
         with pytest.raises(InvalidParameter, match="1 training shape"):

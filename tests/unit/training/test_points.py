@@ -1,10 +1,22 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from model.geometry import Grid
 from tests.analytic_shapes import Ellipsoid
 from training.cohorts import Case
-from training.points import BAND_MM, LEAST_INSIDE, cohort_points, decoder_extent, shape_points, window
+from training.cohorts.inspect import extent_mm
+from training.points import (
+    BAND_MM,
+    LEAST_INSIDE,
+    SMALL_MM,
+    cohort_points,
+    decoder_extent,
+    reduction,
+    shape_points,
+    window,
+)
 from training.sparsify import REGIMES
 
 AFFINE = np.array([[0.0, 0.0, 1.5, -20.0], [-1.0, 0.0, 0.0, 30.0], [0.0, 1.0, 0.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
@@ -82,6 +94,38 @@ def test_a_small_limit_leaves_points_inside():
     assert few.labels.sum() == LEAST_INSIDE
     least = shape_points(known, "dense", np.random.default_rng(0), 20)
     assert least.labels.sum() == 20
+
+
+def scaled(case, factor):
+    return replace(case, grid=Grid(case.grid.shape, np.diag([factor] * 3 + [1.0]) @ case.grid.affine))
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_points_of_small_objects_shrink_along_with_them(regime):
+    case, _ = ellipsoid_case()
+    small = scaled(case, SMALL_MM / extent_mm(case.mask, case.grid))
+    one, other = (
+        shape_points(window(found), regime, np.random.default_rng(0), LIMIT) for found in (small, scaled(small, 0.1))
+    )
+    np.testing.assert_allclose(one.points, 10.0 * other.points, rtol=1e-3, atol=1e-3)
+    np.testing.assert_array_equal(one.labels, other.labels)
+    np.testing.assert_array_equal(one.near, other.near)
+    assert 0.2 < one.labels[one.near].mean() < 0.8
+
+
+def test_organs_keep_the_method_s_distances():
+    case, _ = ellipsoid_case()
+    assert reduction(case.mask, case.grid) == 1.0
+    assert reduction(scaled(case, 0.1).mask, scaled(case, 0.1).grid) < 0.2
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize("factor", [2.0, 6.0])
+def test_large_voxels_have_near_points_of_both_labels(regime, factor):
+    case, _ = ellipsoid_case()
+    found = shape_points(window(scaled(case, factor)), regime, np.random.default_rng(0), LIMIT)
+    assert found.labels[found.near].any()
+    assert not found.labels[found.near].all()
 
 
 def test_points_are_a_pure_function_of_their_seed():
