@@ -15,8 +15,8 @@ from model.inference.thick_slices import through_thickness
 from training.cohorts.cohort import Case
 from training.oblique import SliceStacks
 
-#: Voxels this close to the true surface are scored (mm), at most so many of a case.
-BAND_MM = 5.0
+#: Voxels this close to the true surface are scored (mm, or voxels where they are larger), at most so many of a case.
+BAND_MM, BAND_VOXELS = 5.0, 1.5
 SCORED_VOXELS = 4000
 
 
@@ -44,12 +44,14 @@ def scored_drawing(model: ShapeModel, case: Case, drawing: SliceStacks) -> Score
     found, _ = through_thickness(model, fitted, stacks, observations, options)
     found = with_discrepancy(model, found, stacks, observations, DiscrepancyPrior())
     index = np.argwhere(near_surface(case.mask, case.grid.spacing))
-    index = index[:: -(-len(index) // SCORED_VOXELS)]
+    index = index[:: max(1, -(-len(index) // SCORED_VOXELS))]
     points, truth = case.grid.to_world(index.astype(float)), case.mask[tuple(index.T)]
     return ScoredDrawing(drawing, observations, found, points, truth)
 
 
 def near_surface(mask: Bool[np.ndarray, "i j k"], spacing: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "i j k"]:
-    """Voxels within `BAND_MM` of the surface of a mask."""
+    """Voxels within `BAND_MM`, and `BAND_VOXELS`, of the surface of a mask; all of them where it fills its grid."""
+    if mask.all():
+        return mask
     inside, outside = distance_transform_edt(mask, spacing), distance_transform_edt(~mask, spacing)
-    return np.asarray(np.where(mask, inside, outside) <= BAND_MM)
+    return np.asarray(np.where(mask, inside, outside) <= max(BAND_MM, BAND_VOXELS * float(spacing.max())))

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from model.geometry import Grid
 from model.inference.discrepancy.conditioning import DiscrepancyPrior
 from model.inference.posterior import (
     fitted_jacobians,
@@ -85,3 +86,17 @@ def test_the_band_lies_on_both_sides():
     mask[:15] = True
     rows = near_surface(mask, np.array([1.0, 1.0, 1.0])).any(axis=(1, 2))
     assert np.flatnonzero(rows).tolist() == list(range(10, 20))
+
+
+@pytest.mark.parametrize("spacing", [(6.0, 6.0, 6.0), (2.0, 2.0, 12.0)])
+def test_of_large_voxels_both_sides_are_scored(spacing):
+    grid = Grid((15, 13, 11), np.diag([*spacing, 1.0]))
+    mask = np.zeros(grid.shape, bool)
+    mask[4:11, 4:9, 4:7] = True
+    near = near_surface(mask, grid.spacing)
+    assert (near & mask).any()
+    assert (near & ~mask).any()
+
+
+def test_all_of_a_mask_that_fills_its_grid_is_near():
+    assert near_surface(np.ones((4, 5, 6), bool), np.ones(3)).all()
