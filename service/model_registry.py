@@ -59,7 +59,7 @@ class ModelRegistry:
         if name is None:
             return self._only()
         if name not in models:
-            raise UnknownModel(f"No loaded model has this name; loaded are: {', '.join(self.names()) or 'none'}.")
+            raise self._unknown(name)
         return models[name]
 
     def of_digest(self, digest: str) -> ShapeModel | None:
@@ -74,6 +74,14 @@ class ModelRegistry:
         changed = _digests(found._models) != _digests(self._models) or found.broken != self.broken
         self._models, self.broken = found._models, found.broken
         return changed
+
+    def _unknown(self, name: str) -> UnknownModel:
+        """What to tell of a name that no model has: the versions of a model that is loaded in others, else all."""
+        base, _, _ = name.partition(AT)
+        versions = sorted((pinned for pinned in self._models if pinned.startswith(f"{base}{AT}")), key=_order)
+        if base in self._models and versions:
+            return UnknownModel(f"This model is not loaded in this version; loaded are: {', '.join(versions)}.")
+        return UnknownModel(f"No loaded model has this name; loaded are: {', '.join(self.names()) or 'none'}.")
 
     def _only(self) -> ShapeModel:
         names = self.names()

@@ -101,8 +101,10 @@ def test_versions_stand_side_by_side_and_the_newest_has_the_plain_name(tmp_path)
     assert registry.names() == ("hip",)
     assert registry.get("hip") is registry.get(None) is found["x"]
     assert registry.get("hip@1.9.0") is found["y"]
-    with pytest.raises(UnknownModel):
+    with pytest.raises(UnknownModel, match=r"version; loaded are: hip@1\.9\.0, hip@1\.10\.0\.$"):
         registry.get("hip@2.0.0")
+    with pytest.raises(UnknownModel, match=r"name; loaded are: hip\.$"):
+        registry.get("hi@1.9.0")
 
 
 def test_models_are_found_again(tmp_path):
