@@ -44,7 +44,9 @@ class JobForm(BaseModel):
     )
     mirror: Literal["auto", "never", "always"] = Field("never", description="of reconstructions: as of a single one")
     resolution_mm: SpacingMm | None = Field(None, description="of reconstructions: as of a single one")
-    fidelity: float | None = Field(None, ge=0.0, le=1.0, description="of reconstructions: as of a single one")
+    fidelity: float | None = Field(
+        None, ge=0.0, le=1.0, allow_inf_nan=False, description="of reconstructions: as of a single one"
+    )
     extents: str = Field(USUAL_TEXT, description="of reconstructions: as of a single one")
 
     @field_validator("label")

@@ -96,6 +96,7 @@ def result_summary(result: StoredResult, address: str) -> ResultSummary:
         mesh=f"{address}/mesh",
         segmentation=f"{address}/segmentation",
         occupancy=f"{address}/occupancy",
+        features=f"{address}/features",
         uncertainty=f"{address}/uncertainty" if uncertain else None,
         surface_sd=f"{address}/uncertainty?kind=surface_sd" if uncertain else None,
         posterior=f"{address}/posterior" if uncertain else None,

@@ -64,6 +64,7 @@ class ReconstructionForm(_Closed):
         None,
         ge=0.0,
         le=1.0,
+        allow_inf_nan=False,
         description="0 trusts the model, 1 trusts the slices: share of what the model leaves unexplained on the slices "
         "that the surface follows; the one calibrated for the model when left out",
     )
@@ -95,10 +96,16 @@ class ComparisonQuery(_Closed):
 class MeshQuery(_Closed):
     """Query of a mesh."""
 
-    format: MeshFormat = Field(MeshFormat.PLY, description="file format")
+    format: MeshFormat = Field(
+        MeshFormat.PLY, description="file format; when left out, the one that the header Accept likes best"
+    )
     space: AskedSpace = None
     max_error_mm: float = Field(
-        0.0, ge=0.0, le=10.0, description="fewer triangles, none of them farther than this (mm) from the full surface"
+        0.0,
+        ge=0.0,
+        le=10.0,
+        allow_inf_nan=False,
+        description="fewer triangles, none of them farther than this (mm) from the full surface",
     )
 
 

@@ -117,6 +117,7 @@ class Links(BaseModel):
     mesh: str
     segmentation: str
     occupancy: str
+    features: str
     uncertainty: str | None = Field(description="null when uncertainty was not asked for")
     surface_sd: str | None = Field(description="null when uncertainty was not asked for")
     posterior: str | None = Field(description="null when uncertainty was not asked for")

@@ -10,14 +10,39 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Match, Mount
 
-from model.errors import InputError, InvalidParameter, MorphoFlowError, NotFound, TooLarge
-from service.errors import PROTOCOL_KINDS, HelperLost, Kind, NotReady, Overloaded, Unauthorised, kind_of
+from model.errors import (
+    InputError,
+    InvalidParameter,
+    MorphoFlowError,
+    NotFound,
+    TooLarge,
+    UnknownMode,
+    UnknownModel,
+)
+from service.errors import (
+    PROTOCOL_KINDS,
+    HelperLost,
+    Kind,
+    NotReady,
+    Overloaded,
+    Unauthorised,
+    UnknownJob,
+    UnknownResult,
+    kind_of,
+)
 from service.schemas import Problem
 
 #: What the reader of multipart bodies says of one beyond its own limits.
 _TOO_MANY = re.compile(r"Too many (files|fields)\. Maximum number of \w+ is (\d+)\.")
 _TOO_LONG = re.compile(r"(?:Part|Field) exceeded maximum size of (\d+)KB\.")
 PROBLEM_MEDIA_TYPE = "application/problem+json"
+#: Parts of an address that name what is not here, by the error.
+NAMES: dict[type[NotFound], tuple[str, ...]] = {
+    UnknownModel: ("model",),
+    UnknownMode: ("rank", "mode"),
+    UnknownResult: ("id",),
+    UnknownJob: ("id",),
+}
 #: Methods that a route may take; HEAD goes with GET.
 METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 #: Sentences for what the HTTP layer finds by itself; its own may repeat what the client sent.
@@ -88,7 +113,8 @@ def install_handlers(app: FastAPI, retry_after_s: int) -> None:
     async def domain(request: Request, error: Exception) -> Response:
         if not isinstance(error, MorphoFlowError) or kind_of(error).status == 500:
             raise error
-        return respond_to(error, request_id=request_id_of(request), retry_after_s=retry_after_s)
+        part = _name_of(error, request)
+        return respond_to(error, request_id=request_id_of(request), retry_after_s=retry_after_s, part=part)
 
     async def protocol(request: Request, error: Exception) -> Response:
         if isinstance(error.__cause__, MorphoFlowError):
@@ -98,6 +124,12 @@ def install_handlers(app: FastAPI, retry_after_s: int) -> None:
     app.add_exception_handler(MorphoFlowError, domain)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, protocol)
+
+
+def _name_of(error: MorphoFlowError, request: Request) -> str | None:
+    """The part of the address that names what is not here: one of its path, else the last that may."""
+    names = next((names for kind, names in NAMES.items() if isinstance(error, kind)), ())
+    return next((name for name in names if name in request.path_params), names[-1] if names else None)
 
 
 def request_id_of(request: Request) -> str | None:

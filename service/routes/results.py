@@ -4,7 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
@@ -16,6 +16,7 @@ from service.request_schemas import MeshQuery, UncertaintyQuery, VolumeQuery
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import ResultId, Services, WithServices, WithTicket, address
 from service.routes.meshes import mesh_bytes
+from service.routes.negotiation import listed, negotiate
 from service.routes.reconstructions import PATH
 from service.routes.responses import JSON, MESH_MEDIA_TYPES, NIFTI, Responses, attachment, files, problems
 from service.routes.strict import StrictRoute
@@ -50,7 +51,7 @@ def results_router() -> APIRouter:
         summary="Surface of a result",
         responses={
             200: files(MESH_MEDIA_TYPES.values(), "the surface in the input's world, mm"),
-            **problems(404, 422, 503),
+            **problems(404, 406, 422, 503),
         },
     )
     nifti = files([NIFTI], "a gzipped NIfTI file (.nii.gz)")
@@ -85,8 +86,16 @@ def delete_result(identifier: ResultId, services: WithServices) -> Response:
     return Response(status_code=204)
 
 
+def asked_mesh(query: Annotated[MeshQuery, Query()], request: Request) -> MeshQuery:
+    """The query, with the format that the header Accept asks for where it names none; `NotAcceptable` otherwise."""
+    if "format" in query.model_fields_set:
+        return query
+    media = negotiate(listed(request.headers, "accept"), tuple(MESH_MEDIA_TYPES.values()))
+    return query.model_copy(update={"format": next(f for f, known in MESH_MEDIA_TYPES.items() if known == media)})
+
+
 async def read_mesh(
-    identifier: ResultId, query: Annotated[MeshQuery, Query()], request: Request, services: WithServices
+    identifier: ResultId, query: Annotated[MeshQuery, Depends(asked_mesh)], request: Request, services: WithServices
 ) -> Response:
     """The watertight surface in the input's world or in `space`, mm; the file says which where its format can.
 
@@ -102,7 +111,7 @@ def _mesh(services: Services, identifier: str, query: MeshQuery, check: Check = 
     result = services.store.load(identifier)
     check()
     data = mesh_bytes(services, result, query.format, query.max_error_mm, query.space)
-    headers = attachment(f"reconstruction.{query.format.value}")
+    headers = {**attachment(f"reconstruction.{query.format.value}"), "Vary": "Accept"}
     return Response(data, media_type=MESH_MEDIA_TYPES[query.format], headers=headers)
 
 

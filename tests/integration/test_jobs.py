@@ -263,4 +263,5 @@ def test_the_same_key_of_two_clients_is_two_jobs(tmp_path):
 @pytest.mark.parametrize("name", ["%00", "nothing", "%7Bx%7D"])
 def test_a_name_that_is_no_identifier_is_no_job(client, name):
     for path in (f"{JOBS}/{name}", f"{JOBS}/{name}/events", f"{JOBS}/{name}/result"):
-        assert problem(client.get(path), 404)["type"].endswith("unknown-job")
+        told = problem(client.get(path), 404)
+        assert (told["type"], told["part"]) == ("urn:morphoflow:problem:unknown-job", "id")

@@ -210,6 +210,7 @@ def test_a_deleted_result_has_no_parts(client):
         ({"seed": "x"}, "seed"),
         ({"resolution_mm": "0"}, "resolution_mm"),
         ({"resolution_mm": "nan"}, "resolution_mm"),
+        ({"fidelity": "nan"}, "fidelity"),
         ({"uncertainty": "much"}, "uncertainty"),
         ({"mirror": "maybe"}, "mirror"),
         ({"annotated": "[]"}, "annotated"),

@@ -31,6 +31,29 @@ def test_lines_of_a_header_count_together(client):
     assert client.post(RECONSTRUCTIONS, files=mask_parts(), headers=wishes).status_code == 202
 
 
+@pytest.mark.parametrize(
+    ("accept", "media"),
+    [
+        (None, "application/x-ply"),
+        ("*/*", "application/x-ply"),
+        ("text/html, */*;q=0.8", "application/x-ply"),
+        ("model/stl", "model/stl"),
+        ("model/obj;q=0.5, application/x-mz3", "application/x-mz3"),
+    ],
+)
+def test_a_mesh_without_a_format_is_what_accept_likes_best(client, links, accept, media):
+    with client.stream("GET", links["mesh"], headers={} if accept is None else {"Accept": accept}) as answer:
+        assert (answer.status_code, answer.headers["content-type"]) == (200, media)
+        assert answer.headers["vary"] == "Accept"
+
+
+def test_a_mesh_that_nobody_can_make_is_refused_unless_a_format_is_named(client, links):
+    headers = {"Accept": "text/html"}
+    assert problem(client.get(links["mesh"], headers=headers), 406)["type"].endswith("not-acceptable")
+    named = client.get(links["mesh"], params={"format": "obj"}, headers=headers)
+    assert (named.status_code, named.headers["content-type"]) == (200, "model/obj")
+
+
 def test_a_preference_is_applied_where_there_was_one(client):
     form = {"kind": (None, "samples"), "count": (None, "1")}
     assert "preference-applied" not in client.post("/v1/jobs", files=form).headers

@@ -178,4 +178,10 @@ def test_what_cannot_be_asked_is_named(client, path, status, kind):
 
 def test_an_unknown_model_is_told(client):
     for path in ("modes", "modes/1", "shape"):
-        assert client.get(f"/v1/models/nobody/{path}").json()["type"] == "urn:morphoflow:problem:unknown-model"
+        told = client.get(f"/v1/models/nobody/{path}").json()
+        assert (told["type"], told["part"]) == ("urn:morphoflow:problem:unknown-model", "model")
+
+
+@pytest.mark.parametrize(("path", "part"), [("modes/4", "rank"), ("shape?mode=4:1", "mode")])
+def test_a_mode_that_is_not_there_is_named_as_it_was_asked_for(client, path, part):
+    assert client.get(f"{PLACE}/{path}").json()["part"] == part

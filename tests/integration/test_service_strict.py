@@ -154,7 +154,7 @@ def test_a_result_that_a_parameter_names_and_that_is_not_there_is_named(client, 
     assert (told["type"], told["part"]) == ("urn:morphoflow:problem:unknown-result", name)
     assert f"parameter {name}" in told["detail"]
     whole = place.rsplit("/", 1)[1]
-    assert "part" not in problem(client.get(f"{RECONSTRUCTIONS}/nobody/{path}", params={name: whole}), 404)
+    assert problem(client.get(f"{RECONSTRUCTIONS}/nobody/{path}", params={name: whole}), 404)["part"] == "id"
 
 
 def test_a_spacing_is_refused_where_there_are_no_voxels(client, place):
