@@ -32,6 +32,10 @@ ITERATIONS = 60
 SAMPLED = 0.2
 #: Principal axes are followed only where they explain the mean so much better than the shape as it lies.
 LIKELIER = 0.7
+#: Inner voxels without which principal axes are not known.
+LEAST_INSIDE = 4
+#: Voxels around the object at least: ITK filters no fewer than four along an axis.
+LEAST_PAD = 2
 
 #: Called after each registration: how many are done, of how many.
 Watch = Callable[[int, int], None]
@@ -109,7 +113,12 @@ def registered(
 
 
 def likely_start(shape: Placed, mean: Float[np.ndarray, "i j k"], common: Grid) -> Float[np.ndarray, "4 4"]:
-    """Where to begin: as the shape lies, or its principal axes turned onto the mean's in one of four ways."""
+    """Where to begin: as the shape lies, or its principal axes turned onto the mean's in one of four ways.
+
+    A shape that is thinner than the voxels of the mean begins as it lies.
+    """
+    if min(int((mean > 0).sum()), int((shape.field > 0).sum())) < LEAST_INSIDE:
+        return np.eye(4)
     target = _axes(mean > 0, common)
     own = _axes(shape.field > 0, shape.grid)
     signs = [np.diag(values) for values in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
@@ -169,6 +178,7 @@ def _placed(case: Case) -> Placed:
     box = bounding_box(case.mask)
     sides = np.array([side.stop - side.start for side in box])
     pad = np.ceil(0.35 * (sides * case.grid.spacing).max() / case.grid.spacing).astype(int)
+    pad = np.maximum(pad, LEAST_PAD)
     field = signed_distance(np.pad(case.mask[box], [(int(width), int(width)) for width in pad]), case.grid.spacing)
     world = case.grid.to_world(np.argwhere(case.mask).astype(float))
     centroid = world.mean(axis=0)

@@ -305,3 +305,23 @@ class TestAlignment:
             assert np.array_equal(before[name].mask, after[name].mask)
             assert short_digest(before[name]) == short_digest(after[name])
             assert after[name].grid.spacing == pytest.approx([1.0, 1.0, 1.0])
+
+    @pytest.mark.parametrize("thickness", [1, 2])
+    def test_sheets_thinner_than_the_voxels_of_the_mean_are_aligned(self, thickness):
+        rows, columns = np.mgrid[-45:45, -40:40]
+        cases = []
+        for n in range(4):
+            mask = np.zeros((90, 80, 8), bool)
+            mask[:, :, 3 : 3 + thickness] = ((rows / (30 + n)) ** 2 + (columns / (24 + n)) ** 2 <= 1.0)[:, :, None]
+            cases.append(Case(f"s{n}", f"s{n}", "train", mask, Grid(mask.shape, np.eye(4))))
+        cohort = assemble("sheets", cases, (), Provenance("made here", "CC0", "", shippable=True), CohortOptions())
+        for case in align(cohort).cases:
+            assert np.isfinite(case.grid.affine).all()
+            assert np.degrees(np.arccos(np.clip(case.grid.directions[2, 2], -1.0, 1.0))) < 10.0
+
+    def test_an_object_of_two_voxels_is_aligned(self):
+        masks = np.zeros((3, 9, 9, 9), bool)
+        masks[:, 4, 4, 4] = masks[0, 5, 4, 4] = masks[1, 4, 5, 4] = masks[2, 4, 4, 5] = True
+        cases = [Case(f"v{n}", f"v{n}", "train", mask, Grid(mask.shape, np.eye(4))) for n, mask in enumerate(masks)]
+        cohort = assemble("voxels", cases, (), Provenance("made here", "CC0", "", shippable=True), CohortOptions())
+        assert all(np.isfinite(case.grid.affine).all() for case in align(cohort).cases)
