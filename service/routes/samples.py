@@ -78,7 +78,11 @@ async def read_sample(
 async def read_batch(
     query: Annotated[BatchQuery, Query()], model: WithModel, services: WithServices, ticket: WithTicket
 ) -> Response:
-    """Item i is the shape of `seed` + i, the same as on its own; the manifest comes last."""
+    """Item i is the shape of `seed` + i, the same as on its own; the manifest comes last.
+
+    Its `nearest_training_distance` is not in mm: it is a distance between latent codes, in standard deviations of the
+    flow's base.
+    """
     limits = services.settings
     beyond = f" here; a job of kind samples takes up to {limits.max_job_samples}"
     seeds = use_cases.batch_seeds(query.seed, query.count, limits.max_samples, beyond)
