@@ -17,6 +17,7 @@ from training.interruption import Interruption
 from training.objective import gaussian_entropy, reconstruction_loss, unevenness
 from training.recorded import RecordedStep
 from training.samples import Batch, PointPool, ShapePoints
+from training.saved import intact, read_state
 
 #: File of a training's state in its folder.
 CHECKPOINT = "checkpoint.pt"
@@ -207,12 +208,17 @@ class Trainer:
         part.replace(path)
 
     def load(self, path: Path) -> None:
-        """Continue from a checkpoint of the same configuration; the result is that of an unbroken run."""
-        state = torch.load(path, map_location=self.pool.device, weights_only=True)
-        self.module.load_state_dict(state["module"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.generator.set_state(state["generator"].cpu())
-        self.step = state["step"]
+        """Continue from a checkpoint of the same configuration; the result is that of an unbroken run.
+
+        Raises:
+            InvalidParameter: the checkpoint is damaged.
+        """
+        state = read_state(path, self.pool.device)
+        with intact(path.name):
+            self.module.load_state_dict(state["module"])
+            self.optimiser.load_state_dict(state["optimiser"])
+            self.generator.set_state(state["generator"].cpu())
+            self.step = state["step"]
         self.finished = bool(state.get("finished", False))
         self._make_ready()
 
@@ -264,5 +270,6 @@ def train(trainer: Trainer, folder: Path, watch: Watch = lambda step, figures: N
             watch(trainer.step, figures)
             if interruption.came or trainer.at_end() or trainer.step % trainer.config.checkpoint_every == 0:
                 trainer.save(folder / CHECKPOINT)
-            interruption.stop_at(trainer.step, trainer.config.steps)
+            if not trainer.at_end():
+                interruption.stop_at(trainer.step, trainer.config.steps)
     return trainer.module

@@ -32,6 +32,7 @@ from training.clusters import clusters_in
 from training.config import TrainingConfig
 from training.pruning import PriorParts, Pruned, refitted
 from training.runs import read_record
+from training.saved import intact, read_state
 
 #: Information of one mm^2 of annotated plane where none was calibrated (1/mm^2).
 UNCALIBRATED_PRECISION = 0.1
@@ -207,17 +208,20 @@ def load_module(run: Path, config: TrainingConfig, shapes: int) -> AutoDecoder:
     """The trained module of a run, on the CPU.
 
     Raises:
-        InvalidParameter: the run has not reached its last step.
+        InvalidParameter: the run has not reached its last step, or its checkpoint is damaged.
     """
     path = run / CHECKPOINT
-    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True) if path.is_file() else {"step": 0}
-    if not is_ended(state, config):
+    state: dict[str, Any] = read_state(path, "cpu") if path.is_file() else {"step": 0}
+    with intact(CHECKPOINT):
+        ended = is_ended(state, config)
+    if not ended:
         raise InvalidParameter(
             f"The run stands at step {state['step']} of {config.steps}; a finished run is accepted, see --resume.",
             part="run",
         )
     module = AutoDecoder(config, shapes)
-    module.load_state_dict(state["module"])
+    with intact(CHECKPOINT):
+        module.load_state_dict(state["module"])
     return module.eval()
 
 

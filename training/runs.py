@@ -16,6 +16,7 @@ from training.cohorts.cohort import Case, Cohort, evenly
 from training.config import TrainingConfig, config_from_dict
 from training.difference import first_difference
 from training.points import cohort_points, decoder_extent
+from training.saved import intact, read_state, write_json
 from training.seen import short_digest
 from training.stopping import EarlyStopping
 from training.validation import Validation
@@ -62,7 +63,7 @@ def prepare(cohort: Cohort, config: TrainingConfig, folder: Path, *, resume: boo
     if resume and checkpoint.is_file():
         trainer.load(checkpoint)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / RECORD).write_text(json.dumps(record(cohort, config), indent=2) + "\n", encoding="utf-8")
+    write_json(folder / RECORD, record(cohort, config))
     return Run(trainer, cohort, folder)
 
 
@@ -91,8 +92,9 @@ def is_finished(folder: Path, cohort: Cohort, config: TrainingConfig) -> bool:
     wanted = record(cohort, replace(config, decoder=decoder, device=there.device))
     if _difference(values, there, wanted):
         return False
-    state = torch.load(folder / CHECKPOINT, map_location="cpu", weights_only=True, mmap=True)
-    return is_ended(state, there)
+    state = read_state(folder / CHECKPOINT, "cpu", mmap=True)
+    with intact(CHECKPOINT):
+        return is_ended(state, there)
 
 
 def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
@@ -129,15 +131,16 @@ def read_record(folder: Path) -> tuple[TrainingConfig, dict[str, Any]]:
     """Configuration and record of a run.
 
     Raises:
-        InvalidParameter: the folder holds no run.
+        InvalidParameter: the folder holds no run, or a damaged one.
     """
     path = folder / RECORD
     if not path.is_file():
         raise InvalidParameter(
             "The folder holds no training run; one written by morphoflow train is accepted.", part="run"
         )
-    values = json.loads(path.read_text(encoding="utf-8"))
-    return config_from_dict(values["config"]), values
+    with intact(RECORD):
+        values = json.loads(path.read_text(encoding="utf-8"))
+        return config_from_dict(values["config"]), values
 
 
 def mask_digest(case: Case) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from training.autodecoder import Trainer
+from training.saved import read_state
 
 #: The figure that is watched (nats a band voxel, less is better) and the file of the best module.
 FIGURE, BEST = "validation/cross_entropy", "best.pt"
@@ -23,7 +24,7 @@ class EarlyStopping:
         self._path = folder / BEST
         self._best: dict[str, Any] | None = None
         if trainer.config.patience and trainer.step > 0 and self._path.is_file():
-            self._best = torch.load(self._path, map_location=trainer.pool.device, weights_only=True)
+            self._best = read_state(self._path, trainer.pool.device)
 
     def see(self, figures: dict[str, float]) -> None:
         """Take a validation's figures; ends the run when its time is up."""

@@ -19,6 +19,7 @@ from training.completion.samples import Sample, random_sample
 from training.difference import first_difference
 from training.interruption import Interruption
 from training.points import Window
+from training.saved import intact, read_state
 
 CHECKPOINT = "completion.pt"
 #: Optimiser steps unless a caller says otherwise.
@@ -79,7 +80,7 @@ def train_completion(
             None.
 
     Raises:
-        InvalidParameter: the checkpoint is of other masks or settings.
+        InvalidParameter: the checkpoint is of other masks or settings, or damaged.
         Stopped: interrupted from the keyboard; the checkpoint holds every step that was made.
     """
     made_of = {"config": asdict(config), "masks": list(masks)}
@@ -153,7 +154,7 @@ def _resumed(net: CompletionNet, optimiser: torch.optim.Optimizer, made_of: Mapp
     """Steps that were done already."""
     if not path.is_file():
         return 0
-    state = torch.load(path, map_location="cpu", weights_only=True)
+    state = read_state(path, "cpu")
     found = first_difference({name: state.get(name) for name in made_of}, made_of)
     if found:
         raise InvalidParameter(
@@ -161,9 +162,10 @@ def _resumed(net: CompletionNet, optimiser: torch.optim.Optimizer, made_of: Mapp
             "another folder, are accepted.",
             part="run",
         )
-    net.load_state_dict(state["net"])
-    optimiser.load_state_dict(state["optimiser"])
-    return int(state["step"])
+    with intact(path.name):
+        net.load_state_dict(state["net"])
+        optimiser.load_state_dict(state["optimiser"])
+        return int(state["step"])
 
 
 def _save(

@@ -12,12 +12,13 @@ from model.networks.decoder import DecoderShape
 from model.networks.flow import FlowShape
 from model.networks.prior import PriorShape
 from tests.analytic_shapes import Ellipsoid
+from training.autodecoder import CHECKPOINT
 from training.cohorts import Case, Cohort, Provenance
 from training.cohorts.cohort import NOT_STATED, SideName
 from training.config import TrainingConfig
 from training.interruption import Stopped
-from training.release import active_dimensions
-from training.runs import half_extent, mask_digest, read_record, record, train_cohort
+from training.release import active_dimensions, assembled
+from training.runs import RECORD, half_extent, is_finished, mask_digest, read_record, record, train_cohort
 
 GRID = Grid((24, 24, 24), np.diag([1.0, 1.0, 1.0, 1.0]))
 CONFIG = TrainingConfig(
@@ -101,6 +102,26 @@ def test_the_record_gives_the_configuration_back(tmp_path):
     assert list(record["train"]) == [f"e{n}" for n in range(4)]
     with pytest.raises(InvalidParameter, match="no training run"):
         read_record(tmp_path / "elsewhere")
+
+
+@pytest.mark.parametrize("name", [RECORD, CHECKPOINT])
+@pytest.mark.parametrize("kept", [0.0, 0.5, None])
+def test_a_damaged_run_is_told_of_in_one_sentence(tmp_path, name, kept):
+    train_cohort(ellipsoids(), CONFIG, tmp_path)
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(b"[1, 2]" if kept is None else content[: int(kept * len(content))])
+    with pytest.raises(InvalidParameter, match=f"cannot be read, since {name}") as found:
+        train_cohort(ellipsoids(), CONFIG, tmp_path, resume=True)
+    assert found.value.part == "run"
+    with pytest.raises(InvalidParameter, match=f"cannot be read, since {name}"):
+        assembled(tmp_path, None)
+    with pytest.raises(InvalidParameter, match=f"cannot be read, since {name}"):
+        is_finished(tmp_path, ellipsoids(), CONFIG)
+
+
+def test_no_part_of_a_record_is_left_behind(tmp_path):
+    train_cohort(ellipsoids(), CONFIG, tmp_path)
+    assert not list(tmp_path.glob("*.part"))
 
 
 def test_sides_are_recorded_as_manifests_hold_them():

@@ -1,3 +1,4 @@
+import signal
 from dataclasses import replace
 
 import pytest
@@ -39,6 +40,18 @@ def run(folder, values, config=SMALL, start_at=0):
 
     train(trainer, folder, watch)
     return trainer, seen
+
+
+@pytest.mark.usefixtures("keyboard")
+def test_an_interrupt_at_the_step_that_ends_a_run_does_not_stop_it(tmp_path):
+    def values(step):
+        if step == 14:
+            signal.raise_signal(signal.SIGINT)
+        return abs(step - 10) + 1.0
+
+    trainer, _ = run(tmp_path / "run", values)
+    assert trainer.finished
+    assert trainer.step == 14
 
 
 def same(module, state):

@@ -101,6 +101,15 @@ def test_a_checkpoint_of_other_settings_or_masks_is_refused_and_stays(tmp_path, 
     assert (tmp_path / CHECKPOINT).read_bytes() == before
 
 
+def test_a_damaged_checkpoint_is_told_of(tmp_path):
+    config = replace(CONFIG, steps=2, width=4, batch=1)
+    train_completion(WINDOWS, config, tmp_path, half=False)
+    content = (tmp_path / CHECKPOINT).read_bytes()
+    (tmp_path / CHECKPOINT).write_bytes(content[: len(content) // 2])
+    with pytest.raises(InvalidParameter, match=f"cannot be read, since {CHECKPOINT}"):
+        train_completion(WINDOWS, config, tmp_path, half=False)
+
+
 class TestLoss:
     INSIDE = torch.zeros(1, 4, 4, 4)
     INSIDE[:, 1:3, 1:3, 1:3] = 1.0
