@@ -57,6 +57,11 @@ class FitOptions:
     tolerance: float = 0.25
 
 
+#: By what a voxel of a thick slice is foreground: the object at the slice's centre, half of the thickness filled, or a
+#: share of an even number of fine slices that the thick one was averaged from.
+ThickRule = Literal["section", "half", "at least half", "more than half"]
+
+
 @dataclass(frozen=True)
 class Rival:
     """Another optimum that is nearly as probable and lies elsewhere.
@@ -89,6 +94,9 @@ class Fit:
         trust: share of the model's likelihood precision that the drawing was given; below 1 for a rough one.
         full_trust_misfit_mm: how far the contours of a rough drawing lay from the fit that trusted it in full (RMS);
             None of any other.
+        thick_rule: by what thick slices were drawn, as far as can be told.
+        thick_doubt: (t, 3) how far the object's ends may lie elsewhere because it might have been another rule (SD,
+            world mm) along the normal of each direction of thick slices; None without such slices.
     """
 
     latent: Float[np.ndarray, "d"]
@@ -104,3 +112,5 @@ class Fit:
     discrepancy: Discrepancy | None = None
     trust: float = 1.0
     full_trust_misfit_mm: float | None = None
+    thick_rule: ThickRule = "half"
+    thick_doubt: Float[np.ndarray, "t 3"] | None = None

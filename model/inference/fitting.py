@@ -93,7 +93,13 @@ def refit(model: ShapeModel, observations: Observations, found: Fit, options: Fi
     if found.plane_weights is not None:
         observations = reweighted(observations, found.plane_weights)
     anew = _from_place(model, observations, found, starting_poses(observations, options)[0], options)
-    return replace(anew, plane_weights=found.plane_weights, doubted=found.doubted, rival=found.rival)
+    return replace(
+        anew,
+        plane_weights=found.plane_weights,
+        doubted=found.doubted,
+        rival=found.rival,
+        thick_rule=found.thick_rule,
+    )
 
 
 def fit_from(model: ShapeModel, observations: Observations, starts: Sequence[Start], options: FitOptions) -> Fit:

@@ -83,7 +83,12 @@ def surface_spread(
         moves = member_moves(model, found, state.members, mesh, known)
         factors = (moves - moves.mean(axis=1, keepdims=True)) / np.sqrt(len(state.members) - 1)
     shared = np.full((len(canonical), 1), offset_mm, factors.dtype)
-    return SurfaceSpread(np.concatenate([factors, shared], axis=1), local)
+    return SurfaceSpread(np.concatenate([factors, shared, *_ends(found, mesh)], axis=1), local)
+
+
+def _ends(found: Fit, mesh: Mesh) -> list[Float[np.ndarray, "v k"]]:
+    """Outward movements (mm) where it is not known by what rule thick slices were drawn: both ends move in or out."""
+    return [] if found.thick_doubt is None else [np.abs(mesh.normals @ found.thick_doubt.T).astype(np.float32)]
 
 
 def calibrated_scale(model: ShapeModel) -> tuple[float, float]:

@@ -163,7 +163,7 @@ def _told_of(
     model: ShapeModel, found: Fit, levels: Levels, seen: _Evidence, at_centres: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
     """Distance from the fitted surface (mm) that is observed at each point: that there, on thin slices."""
-    thick = seen.columns.counts > 0
+    thick = seen.columns.counts > 1
     if not thick.any():
         return at_centres
 
@@ -182,7 +182,7 @@ def _evidence(model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observ
     used = trusted[plane_of]
     contour, plane_of = contour[used], plane_of[used]
     wrong, distances = _wrong_side(model, found, observations, trusted, contour, plane_of)
-    columns = columns_of(stacks, observations.planes)
+    columns = columns_of(stacks, observations.planes, found.thick_rule)
     whole = _Evidence(
         np.concatenate([contour, observations.points[wrong]]),
         np.concatenate([np.zeros(len(contour)), distances]),
@@ -195,7 +195,11 @@ def _evidence(model: ShapeModel, found: Fit, stacks: Sequence[MaskStack], observ
     means = _Evidence(
         means_of(cells, whole.points),
         means_of(cells, whole.distances[:, None])[:, 0],
-        Columns(means_of(cells, whole.columns.vectors), means_of(cells, whole.columns.widths_mm[:, None])[:, 0]),
+        Columns(
+            means_of(cells, whole.columns.vectors),
+            means_of(cells, whole.columns.widths_mm[:, None])[:, 0],
+            found.thick_rule,
+        ),
     )
     return means[_spread_out(found.pose.to_canonical(means.points), means.distances != 0.0)]
 

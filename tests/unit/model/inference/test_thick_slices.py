@@ -14,7 +14,16 @@ from model.inference.mesh import volume_ml
 from model.inference.observations import MaskStack, find_planes, observe
 from model.inference.posterior import model_logits
 from model.inference.reconstruction import Options, reconstruct
-from model.inference.thick_slices import MOST_SLICES, Columns, columns_of, decided, through_thickness
+from model.inference.thick_slices import (
+    EVEN_RULES,
+    MOST_SLICES,
+    Columns,
+    columns_of,
+    decided,
+    median_rule,
+    settled_under,
+    through_thickness,
+)
 from tests.analytic_model import MEAN_AXES, SPREAD, ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import PARALLEL, cube_around, drawn
@@ -22,18 +31,34 @@ from tests.drawn_shapes import PARALLEL, cube_around, drawn
 CENTRE = np.array([30.0, -20.0, 50.0])
 MODEL = ellipsoid_model()
 TRUTH = Ellipsoid((13.0, 9.5, 6.5), CENTRE)
+TRUTH_MM3 = 4.0 / 3.0 * np.pi * np.prod(TRUTH.semi_axes)
 THICKNESS = 5
 OPTIONS = FitOptions(robust=False, tolerance=1e-4)
 
 
-def thick_stack(thickness=THICKNESS, nodes=45):
-    """Blocks of slices of 1 mm, averaged and cut at one half."""
+def filled(share, rule):
+    """Which columns are foreground of which such a share is filled."""
+    return share > 0.5 if rule == "more than half" else share >= 0.5
+
+
+def thick_stack(thickness=THICKNESS, nodes=45, rule="at least half"):
+    """Blocks of slices of 1 mm, averaged and cut at one half; of finer ones where nothing is to be half filled."""
+    finer = 9 if rule == "half" else 1
     fine = cube_around(CENTRE, nodes=nodes)
-    blocks = TRUTH.mask(fine).reshape(nodes, nodes, -1, thickness).mean(axis=3) >= 0.5
+    offsets = fine.affine[:3, 2] * ((np.arange(finer) + 0.5) / finer - 0.5)[:, None]
+    parts = [TRUTH.mask(Grid(fine.shape, moved(fine.affine, offset))) for offset in offsets]
+    share = np.mean([part.reshape(nodes, nodes, -1, thickness).mean(axis=3) for part in parts], axis=0)
+    blocks = filled(share, rule)
     affine = fine.affine.copy()
     affine[:3, 2] *= thickness
     affine[:3, 3] += fine.affine[:3, 2] * (thickness - 1) / 2
     return MaskStack("mask[0]", Grid((nodes, nodes, nodes // thickness), affine), blocks, np.zeros(blocks.shape, bool))
+
+
+def moved(affine, offset):
+    result = affine.copy()
+    result[:3, 3] += offset
+    return result
 
 
 def observed(stack):
@@ -57,37 +82,58 @@ def test_columns_are_the_thickness_of_thick_slices_alone():
     np.testing.assert_allclose(columns.vectors, np.tile([0.0, 0.0, 5.0], (len(planes), 1)))
     assert (columns.counts == 5).all()
     thin = drawn(TRUTH, cube_around(CENTRE), PARALLEL)
-    assert not columns_of([thin], find_planes([thin], PARALLEL)).counts.any()
+    assert columns_of([thin], find_planes([thin], PARALLEL)).rules == ()
 
 
-@pytest.mark.parametrize(("thickness", "width", "count"), [(8.0, 1.0, 8), (5.0, 0.7, 7), (5.0, 2.0, 2), (9.0, 0.3, 15)])
-def test_a_thick_slice_averages_slices_as_thick_as_its_voxels_are_wide(thickness, width, count):
-    columns = Columns(np.array([[0.0, thickness, 0.0]]), np.array([width]))
-    assert columns.counts.tolist() == [count]
-    assert count <= MOST_SLICES
+@pytest.mark.parametrize(
+    ("thickness", "width", "rule", "count"),
+    [
+        (8.0, 1.0, "at least half", 8),
+        (5.0, 0.7, "more than half", 7),
+        (5.0, 2.0, "at least half", 2),
+        (9.0, 0.3, "at least half", MOST_SLICES),
+        (8.0, 1.0, "half", 9),
+        (5.0, 0.7, "half", 7),
+        (8.0, 1.0, "section", 1),
+        (0.0, 1.0, "half", 1),
+        (0.0, 1.0, "at least half", 1),
+    ],
+)
+def test_a_thick_slice_averages_slices_as_thick_as_its_voxels_are_wide(thickness, width, rule, count):
+    """An odd number of them where none is half filled."""
+    assert Columns(np.array([[0.0, thickness, 0.0]]), np.array([width]), rule).counts.tolist() == [count]
+
+
+@pytest.mark.parametrize(("thickness", "width", "even"), [(8.0, 1.0, True), (3.0, 0.5, True), (5.0, 1.0, False)])
+def test_slices_an_even_number_of_voxels_thick_may_have_been_averaged_from_them(thickness, width, even):
+    thick, thin = [0.0, thickness, 0.0], [0.0, 0.0, 0.0]
+    assert ("at least half" in Columns(np.array([thick, thin]), np.full(2, width)).rules) == even
+    uneven = Columns(np.array([[0.0, thickness + 0.3 * width, 0.0], thin]), np.full(2, width))
+    assert uneven.rules == ("half", "section")
 
 
 @settings(max_examples=50)
-@given(st.integers(2, MOST_SLICES), st.integers(0, 2**32 - 1))
-def test_the_deciding_value_has_the_sign_of_the_average_cut_at_one_half(count, seed):
+@given(st.integers(2, MOST_SLICES), st.integers(0, 2**32 - 1), st.sampled_from(["at least half", "more than half"]))
+def test_the_deciding_value_has_the_sign_of_the_average_cut_at_one_half(count, seed, rule):
     """Whatever the field does between the slices."""
     random = np.random.default_rng(seed)
     points = random.uniform(-9.0, 9.0, (40, 3))
-    columns = Columns(np.tile([0.0, 0.0, float(count)], (40, 1)), np.ones(40))
+    columns = Columns(np.tile([0.0, 0.0, float(count)], (40, 1)), np.ones(40), rule)
     waves = random.normal(size=3)
     field = lambda at: np.sin(at @ waves) + 0.3 * np.sin(9.0 * at[:, 2])  # noqa: E731
     places, values = decided(field, points, columns)
     fine = [field(points + (step + 0.5 - count / 2) * np.array([0.0, 0.0, 1.0])) > 0 for step in range(count)]
-    np.testing.assert_array_equal(values > 0, np.mean(fine, axis=0) >= 0.5)
+    np.testing.assert_array_equal(values > 0, filled(np.mean(fine, axis=0), rule))
     np.testing.assert_allclose(field(places), values, atol=1e-12)
 
 
 def test_thin_and_thick_slices_are_decided_together():
     points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
-    columns = Columns(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 8.0]]), np.ones(2))
-    places, values = decided(lambda at: -at[:, 2], points, columns)
-    np.testing.assert_allclose(places[:, 2], [1.0, 0.5])  # the upper of the two in the middle
-    np.testing.assert_allclose(values, [-1.0, -0.5])
+    for rule, place in (("section", 1.0), ("at least half", 0.5), ("half", 1.0), ("more than half", 1.5)):
+        columns = Columns(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 8.0]]), np.ones(2), rule)
+        places, values = decided(lambda at: -at[:, 2], points, columns)
+        np.testing.assert_allclose(places[:, 2], [1.0, place])
+        np.testing.assert_allclose(values, [-1.0, -place])
 
 
 def test_thin_slices_are_left_as_they_are():
@@ -133,14 +179,60 @@ def test_contours_of_thick_slices_ask_little_of_the_shape_that_was_drawn():
 
 @pytest.mark.parametrize(("thickness", "nodes"), [(3, 45), (4, 44), (5, 45)])
 def test_volumes_from_thick_slices_are_those_of_the_shape(thickness, nodes):
-    """Slices of an even number of voxels draw half a voxel more at either end."""
-    stack = thick_stack(thickness, nodes)
-    drawn_mm3 = stack.foreground.sum() * np.prod(stack.grid.spacing)
+    stack = thick_stack(thickness, nodes, "half")
     answer = reconstruct(MODEL, [stack], Options(annotated="nonempty"))
-    truth_mm3 = 4.0 / 3.0 * np.pi * np.prod(TRUTH.semi_axes)
-    assert 1000.0 * volume_ml(answer.mesh) == pytest.approx(truth_mm3, rel=0.02)
-    if thickness % 2 == 0:
-        assert drawn_mm3 > 1.04 * truth_mm3
+    assert 1000.0 * volume_ml(answer.mesh) == pytest.approx(TRUTH_MM3, rel=0.03)
+
+
+@pytest.mark.parametrize(("rule", "more"), [("at least half", 0.11), ("half", 0.01), ("more than half", -0.08)])
+def test_the_rule_makes_up_for_what_was_drawn_too_much_or_too_little(rule, more):
+    """Slices of an even number of voxels draw half a voxel more or less at either end."""
+    stack = thick_stack(4, 44, rule)
+    assert stack.foreground.sum() * np.prod(stack.grid.spacing) == pytest.approx((1.0 + more) * TRUTH_MM3, rel=0.01)
+    observations = observed(stack)
+    columns = columns_of([stack], observations.planes)[observations.plane_of]
+    settled, _ = settled_under(MODEL, fit(MODEL, observations, OPTIONS), rule, observations, columns, OPTIONS)
+    assert settled.thick_rule == rule
+    assert 4.0 / 3.0 * np.pi * np.prod(semi_axes(settled)) == pytest.approx(TRUTH_MM3, rel=0.02)
+
+
+def test_a_rule_that_the_drawing_does_not_tell_makes_intervals_wider():
+    """Ellipsoids of all thicknesses are alike."""
+    answer, sure = (
+        reconstruct(MODEL, [thick_stack(thickness, nodes, "half")], Options(annotated="nonempty"))
+        for thickness, nodes in ((4, 44), (5, 45))
+    )
+    assert answer.volume_ml.low < TRUTH_MM3 / 1000.0 < answer.volume_ml.high
+    assert np.diff([answer.volume_ml.low, answer.volume_ml.high]) > 1.5 * np.diff(
+        [sure.volume_ml.low, sure.volume_ml.high]
+    )
+    doubt = answer.state.fits[0].thick_doubt
+    np.testing.assert_allclose(doubt[:, :2], 0.0, atol=1e-6)
+    assert 0.1 < np.abs(doubt[0, 2]) < 0.6
+
+
+def test_no_doubt_of_the_rule_where_none_would_move_the_ends():
+    answer = reconstruct(MODEL, [thick_stack(5, 45)], Options(annotated="nonempty"))
+    assert not answer.state.fits[0].thick_doubt.any()
+    thin = drawn(TRUTH, cube_around(CENTRE), PARALLEL)
+    assert reconstruct(MODEL, [thin], Options(annotated=PARALLEL)).state.fits[0].thick_doubt is None
+
+
+class TestMedianRule:
+    def test_one_that_explains_far_better_is_taken_and_leaves_no_doubt(self):
+        for best in ("half", "section", "at least half", "more than half"):
+            objectives = {rule: 10.0 + 30.0 * (rule != best) for rule in ("half", "section", *EVEN_RULES)}
+            rule, doubt = median_rule(objectives)
+            assert rule == best
+            assert doubt < 1e-3
+
+    def test_between_two_extremes_the_middle_is_taken_with_the_doubt_of_both(self):
+        rule, doubt = median_rule({"half": 1.0, "section": 2.0, "at least half": 1.0, "more than half": 1.0})
+        assert rule == "half"
+        assert doubt == pytest.approx(np.sqrt(2.0 / (3.0 + np.exp(-1.0))))
+
+    def test_rules_that_end_alike_leave_no_doubt(self):
+        assert median_rule({"half": 3.0, "section": 2.0}) == ("section", 0.0)
 
 
 def test_contours_of_thin_slices_run_in_them():
