@@ -248,7 +248,8 @@ def _draw(
     near_rows, far_rows = np.flatnonzero(near), np.flatnonzero(~near)
     reserved = min(far_rows.size, int(COVER_SHARE * budget))
     near_count = min(near_rows.size, budget - reserved)
-    far_count = int(min(budget - near_count, max(COVER_LEAST, cover * near_count)))
+    allowed = max(COVER_LEAST, cover * near_count) if np.isfinite(cover) else far_rows.size
+    far_count = int(min(budget - near_count, allowed))
     far_size = area[far_rows] / (1.0 + np.minimum(distance[far_rows], COVER_MARGIN_MM) / COVER_DECAY_MM)
     rows, weights = [], []
     for group, size, count in ((near_rows, area[near_rows], near_count), (far_rows, far_size, far_count)):

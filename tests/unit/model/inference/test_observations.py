@@ -95,6 +95,17 @@ def test_a_limited_cover_keeps_the_band_and_the_sums():
     np.testing.assert_allclose(limited.weights.sum(), whole.weights.sum(), rtol=0.15)
 
 
+@pytest.mark.parametrize("budget", [500, 2500])
+def test_without_a_contour_the_budget_is_used_all_the_same(budget):
+    full = stack_of(np.ones(SHAPE, bool))
+    planes = [Plane(0, 2, index) for index in range(SHAPE[2])]
+    observations = observe([full], planes, budget=budget, seed=0)
+    assert len(observations.points) == pytest.approx(budget, abs=1)
+    assert observations.labels.all()
+    limited = observe([full], planes, budget=budget, seed=0, cover=0.5)
+    assert len(limited.points) == pytest.approx(300, abs=1)
+
+
 def test_the_same_seed_gives_the_same_observations():
     stack, planes = example()
     one, two, other = (observe([stack], planes, budget=700, seed=seed) for seed in (5, 5, 6))
