@@ -39,6 +39,7 @@ def check_values(values: Mapping[str, Any]) -> None:
             "dimensions of latent_size is accepted."
         )
     _check_clusters(values.get("clusters", {}), values["latent_size"])
+    _check_completion(values.get("completion", {}))
     for name, keys in GROUPS.items():
         group = values.get(name, {})
         if not isinstance(group, Mapping):
@@ -64,6 +65,16 @@ def _check_clusters(clusters: object, latent_size: int) -> None:
         )
 
 
+def _check_completion(completion: object) -> None:
+    """The lattice is checked where the network is opened."""
+    share = completion.get("share", 0.0) if isinstance(completion, Mapping) else None
+    if not (isinstance(share, int | float) and _is_number(share) and 0.0 <= share <= 1.0):
+        raise BundleCorrupt(
+            f"completion of the manifest has a share {_shown(share)}; a number from 0 to 1 is accepted, calibrate the "
+            "model anew."
+        )
+
+
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
@@ -85,6 +96,13 @@ def _all(length: int | None, is_right: Callable[[object], bool]) -> Callable[[ob
     return check
 
 
+def _are_figures(value: object) -> bool:
+    """Numbers by name, by regime."""
+    if not isinstance(value, Mapping) or not all(isinstance(group, Mapping) for group in value.values()):
+        return False
+    return all(_is_number(figure) for group in value.values() for figure in group.values())
+
+
 def _one_of(*known: str) -> Callable[[object], bool]:
     return lambda value: value in known
 
@@ -104,4 +122,6 @@ _RULES: tuple[tuple[str, Callable[[object], bool], str], ...] = (
     ("half_extent_mm", _all(3, _is_positive), "three positive numbers are"),
     ("resolution_mm", _is_positive, "a positive number is"),
     ("likelihood_precision", _is_positive, "a positive number is"),
+    ("active_dimensions", _all(3, _is_count), "three whole numbers from 1 are"),
+    ("accuracy", _are_figures, "finite numbers by regime and name are"),
 )

@@ -61,14 +61,15 @@ def summarise(measurements: Sequence[Measurement]) -> list[Row]:
 
 
 def record_accuracy(bundle: Path, rows: Sequence[Row], split: str) -> None:
-    """Write the model's mean figures into its bundle's manifest, by regime.
+    """Write the model's mean figures into its bundle's manifest, by regime; those that are not finite are left out.
 
     Raises:
         BundleError: the manifest cannot be read.
     """
     manifest, _ = read_manifest(bundle)
     measured = {
-        f"{split}/{row.regime}": {"cases": float(row.cases)} | {name: row.figures[name].mean for name in FIGURES}
+        f"{split}/{row.regime}": {"cases": float(row.cases)}
+        | {name: row.figures[name].mean for name in FIGURES if np.isfinite(row.figures[name].mean)}
         for row in rows
         if row.method == Method.MODEL
     }
