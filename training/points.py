@@ -78,16 +78,24 @@ def reduction(mask: Bool[np.ndarray, "i j k"], grid: Grid) -> float:
     return min(1.0, extent_mm(mask, grid) / SMALL_MM)
 
 
-def cohort_points(cases: Sequence[Case], regime: Regime, seed: int, threads: int = 1) -> list[ShapePoints]:
-    """Points of all training shapes; a pure function of cases, regime and seed, whatever the number of threads.
+def cuts_are_ends(cases: Sequence[Case]) -> bool:
+    """Whether a cut counts as the object's end: where most of the masks touch their crops, as cut bones do."""
+    return 2 * sum(touches_border(case.mask) for case in cases) > len(cases)
 
-    When most of the masks touch their crops, as cut bones do, the cut counts as the object's end.
+
+def cohort_points(
+    cases: Sequence[Case], regime: Regime, seed: int, threads: int = 1, *, cut_is_end: bool | None = None
+) -> list[ShapePoints]:
+    """Points of all shapes; a pure function of cases, regime and seed, whatever the number of threads.
+
+    Args:
+        cut_is_end: see `window`; what `cuts_are_ends` says of the cases when None.
     """
-    cut_is_end = 2 * sum(touches_border(case.mask) for case in cases) > len(cases)
+    ends = cuts_are_ends(cases) if cut_is_end is None else cut_is_end
     limit = int(np.clip(TOTAL_POINTS // max(len(cases), 1), *POINTS_RANGE))
 
     def points_of(case: Case, rng: np.random.Generator) -> ShapePoints:
-        return shape_points(window(case, cut_is_end=cut_is_end), regime, rng, limit)
+        return shape_points(window(case, cut_is_end=ends), regime, rng, limit)
 
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(points_of, cases, np.random.default_rng(seed).spawn(len(cases))))

@@ -15,7 +15,7 @@ from training.autodecoder import CHECKPOINT, AutoDecoder, Trainer, Watch, is_end
 from training.cohorts.cohort import Case, Cohort, evenly
 from training.config import TrainingConfig, config_from_dict
 from training.difference import first_difference
-from training.points import cohort_points, decoder_extent
+from training.points import cohort_points, cuts_are_ends, decoder_extent
 from training.saved import intact, read_state, write_json
 from training.seen import short_digest
 from training.stopping import EarlyStopping
@@ -198,8 +198,9 @@ def _validating_watch(
     config = trainer.config
     if not cohort.validation:
         return watch
-    chosen = evenly(cohort.validation, VALIDATED)
-    validation = Validation(config, cohort_points(chosen, "dense", config.seed, torch.get_num_threads()))
+    chosen, ends = evenly(cohort.validation, VALIDATED), cuts_are_ends(cohort.train)
+    points = cohort_points(chosen, "dense", config.seed, torch.get_num_threads(), cut_is_end=ends)
+    validation = Validation(config, points)
 
     def validate(step: int, figures: dict[str, float]) -> None:
         watch(step, figures)

@@ -14,8 +14,7 @@ from model.geometry import Grid
 from training.baselines.distance import signed_distance
 from training.baselines.distance_modes import DistanceModes
 from training.cohorts.cohort import Case
-from training.cohorts.inspect import touches_border
-from training.points import window
+from training.points import cuts_are_ends, window
 
 #: Modes beyond this share of the variance are not kept, nor more than so many.
 KEPT_SHARE, MOST_MODES = 0.995, 160
@@ -33,9 +32,9 @@ def learn_modes(cases: Sequence[Case], clip_mm: float) -> DistanceModes:
     """
     if len(cases) < 2:
         raise ValueError("Principal modes need at least two masks.")
-    cut_is_end = 2 * sum(touches_border(case.mask) for case in cases) > len(cases)
+    ends = cuts_are_ends(cases)
     grid = canonical_grid(cases)
-    fields = np.stack([_field(case, grid, clip_mm, cut_is_end=cut_is_end) for case in cases])
+    fields = np.stack([_field(case, grid, clip_mm, cut_is_end=ends) for case in cases])
     mean = fields.mean(axis=0)
     fields -= mean
     modes, shares = _principal(fields)

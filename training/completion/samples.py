@@ -11,7 +11,7 @@ from model.geometry import CanonicalLattice
 from model.inference.completion.drawn import drawn_at
 from training.cohorts.cohort import Case
 from training.completion.drawings import random_drawing
-from training.points import Window, window
+from training.points import Window, cuts_are_ends, window
 
 #: SDs of the place of the origin (mm), as far as fits are off, and of the entries of a linear map of the shape.
 PLACED_MM, BENT = 1.5, 0.07
@@ -40,7 +40,8 @@ class Sample:
 
 def windows_of(cases: Sequence[Case]) -> list[Window]:
     """The masks with enough background around them."""
-    return [window(case, MARGIN_MM) for case in cases]
+    ends = cuts_are_ends(cases)
+    return [window(case, MARGIN_MM, cut_is_end=ends) for case in cases]
 
 
 def lattice_for(windows: Sequence[Window], most_voxels: int, least_step_mm: float, multiple: int) -> CanonicalLattice:

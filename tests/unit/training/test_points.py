@@ -12,6 +12,7 @@ from training.points import (
     LEAST_INSIDE,
     SMALL_MM,
     cohort_points,
+    cuts_are_ends,
     decoder_extent,
     reduction,
     shape_points,
@@ -126,6 +127,17 @@ def test_large_voxels_have_near_points_of_both_labels(regime, factor):
     found = shape_points(window(scaled(case, factor)), regime, np.random.default_rng(0), LIMIT)
     assert found.labels[found.near].any()
     assert not found.labels[found.near].all()
+
+
+def test_where_most_masks_touch_their_crops_cuts_are_ends_for_all():
+    whole, _ = ellipsoid_case()
+    cut = replace(whole, mask=whole.mask[:18], grid=Grid((18, *whole.grid.shape[1:]), whole.grid.affine))
+    assert cuts_are_ends([cut, cut, whole])
+    assert not cuts_are_ends([cut, whole])
+    (ended,), (opened,) = (cohort_points([cut], "dense", 0, cut_is_end=end) for end in (True, False))
+    (by_rule,) = cohort_points([cut], "dense", 0)
+    np.testing.assert_array_equal(by_rule.points, ended.points)
+    assert len(opened.points) < len(ended.points)
 
 
 def test_points_are_a_pure_function_of_their_seed():

@@ -68,7 +68,9 @@ def test_a_mirrored_sample_is_the_mirror_image():
 
 def test_beyond_a_face_that_cuts_the_object_off_nothing_is_known():
     grid = Grid((16, 30, 24), AFFINE)
-    (cut,) = windows_of([Case("cut", "a", "train", SHAPE.mask(GRID)[:16], grid)])
+    case = Case("cut", "a", "train", SHAPE.mask(GRID)[:16], grid)
+    cut = windows_of([case, Case("whole", "b", "train", SHAPE.mask(GRID), GRID)])[0]
+    assert not windows_of([case])[0].unknown.any()  # where most are cut, the cut is the end
     sample = random_sample(cut, LATTICE, np.random.default_rng(0))
     assert 0.2 < np.mean(~sample.known) < 0.8
     assert sample.inside[~sample.known].max() <= 0.5
