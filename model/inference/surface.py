@@ -137,7 +137,8 @@ def require_step(
     if not step > 0 or np.prod(np.ceil(2 * canonical_box(model) / step) + 1) <= max_voxels:
         return
     size = f" for an object {1.0 / scale:.2g} times as large as the model's" if log_scale < 0 else ""
-    sentence = f"The parameter {part} asks for more than {max_voxels} voxels{size}; ask for a coarser one."
+    asked = f"The parameter {part} asks for" if step_mm is not None else "The model's own step makes"
+    sentence = f"{asked} more than {max_voxels} voxels{size}; a coarser {part} is accepted."
     raise TooLarge(sentence, part=part)
 
 
