@@ -16,6 +16,7 @@ from model.errors import CohortError
 from model.geometry import Grid
 from model.inference.observations import MaskStack, Plane
 from training.cohorts.cohort import Case
+from training.placing import inner_points
 from training.sparsify import Drawing, body_axes
 
 #: Least area (mm^2) of a section that counts as holding the object; of a small object, this share of its largest axial
@@ -47,7 +48,7 @@ def random_planes(case: Case, count: int, seed: int = 0, *, tries: int = TRIES) 
         CohortError: none of so many tries for a plane holds the object; names the case.
     """
     rng = _stream(case.name, seed)
-    world = case.grid.to_world(np.argwhere(case.mask).astype(float))
+    world = inner_points(case.mask, case.grid)
     stacks = tuple(_holding(case, world, rng, tries, f"mask[{number}]") for number in range(count))
     return SliceStacks(stacks, tuple(Plane(number, 2, 0) for number in range(count)))
 

@@ -17,6 +17,7 @@ from model.geometry import Grid
 from model.inference.mask_stack import MaskStack, Plane, section_of
 from training.cohorts.cohort import Case
 from training.oblique import random_planes, section
+from training.placing import inner_points
 from training.sparsify import Drawing, body_axes
 
 WrongKind = Literal["shifted", "another case", "mirrored", "dilated", "misplaced"]
@@ -118,7 +119,7 @@ def tilted(case: Case, degrees: float, count: int = 5) -> Sections:
     along = case.grid.affine[:3, axis] / case.grid.spacing[axis]
     about = case.grid.affine[:3, (axis + 1) % 3]
     normal = Rotation.from_rotvec(np.radians(degrees) * about / np.linalg.norm(about)).apply(along)
-    reach = case.grid.to_world(np.argwhere(case.mask).astype(float)) @ normal
+    reach = inner_points(case.mask, case.grid) @ normal
     places = reach.min() + (np.arange(count) + 0.5) * np.ptp(reach) / count
     stacks = tuple(section(case, normal, float(place), f"mask[{n}]") for n, place in enumerate(places))
     return Sections(stacks, (2,) * count)

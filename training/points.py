@@ -17,6 +17,7 @@ from scipy.ndimage import distance_transform_edt
 from model.geometry import Grid
 from training.cohorts.cohort import Case
 from training.cohorts.inspect import bounding_box, cut_faces, extent_mm, touches_border
+from training.placing import centroid
 from training.samples import ShapePoints
 from training.sparsify import Drawing, Regime, for_training
 
@@ -109,7 +110,7 @@ def shape_points(found: Window, regime: Regime, rng: np.random.Generator, limit:
     world = np.concatenate([drawing.stack.grid.to_world(index.astype(float)), _far_cover(found, rng)])
     at = tuple(index.T)
     background = np.zeros(len(world) - len(index), bool)
-    centre = found.grid.to_world(np.argwhere(found.mask).astype(float)).mean(axis=0)
+    centre = centroid(found.mask, found.grid)
     return ShapePoints(
         (world - centre).astype(np.float32),
         np.concatenate([drawing.stack.foreground[at], background]),

@@ -10,8 +10,8 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.ndimage import map_coordinates
 from skimage import measure
 
-from training.baselines.distance import signed_distance
 from training.cohorts.cohort import Case
+from training.distance import signed_distance
 
 #: Largest number of grid steps along a drawn surface, which keeps the number of triangles down.
 STEPS = 60

@@ -15,6 +15,7 @@ from training.autodecoder import CHECKPOINT, AutoDecoder, Trainer, Watch, is_end
 from training.cohorts.cohort import Case, Cohort, evenly
 from training.config import TrainingConfig, config_from_dict
 from training.difference import first_difference
+from training.placing import reach_with_voxels
 from training.points import cohort_points, cuts_are_ends, decoder_extent
 from training.saved import intact, read_state, write_json
 from training.seen import short_digest
@@ -120,10 +121,7 @@ def record(cohort: Cohort, config: TrainingConfig) -> dict[str, Any]:
 
 def half_extent(cohort: Cohort) -> list[float]:
     """Half size of the canonical box that holds every training shape, voxels included (mm along R, A, S)."""
-    reaches = []
-    for case in cohort.train:
-        world = case.grid.to_world(np.argwhere(case.mask).astype(float))
-        reaches.append(np.abs(world - world.mean(axis=0)).max(axis=0) + case.grid.spacing.max() / 2)
+    reaches = [reach_with_voxels(case.mask, case.grid) for case in cohort.train]
     return [float(value) for value in np.max(reaches, axis=0)]
 
 

@@ -10,10 +10,11 @@ from skimage import measure
 
 from benchmarks.generator.surfaces import Surface, surface_from
 from model.inference.mesh import mesh_of, volume_ml
-from training.baselines.distance import signed_distance
-from training.baselines.distance_learning import centroid, learn_modes
+from training.baselines.distance_learning import learn_modes
 from training.baselines.distance_modes import DistanceModes
 from training.cohorts.cohort import Case
+from training.distance import signed_distance
+from training.placing import centroid
 
 #: Signed distances are clipped here (mm), as in the benchmark of accuracy.
 CLIP_MM = 10.0
@@ -42,7 +43,7 @@ def surface_at(modes: DistanceModes, coefficients: Float[np.ndarray, "k"]) -> Su
 def projected(modes: DistanceModes, case: Case) -> Surface | None:
     """A mask as the modes describe it: its field's coefficients by least squares, its centroid at the origin."""
     distance = np.clip(signed_distance(np.pad(case.mask, 8), case.grid.spacing), -modes.clip_mm, modes.clip_mm)
-    index = case.grid.to_index(modes.grid.centres() + centroid(case)) + 8
+    index = case.grid.to_index(modes.grid.centres() + centroid(case.mask, case.grid)) + 8
     field = map_coordinates(distance, index.T, order=1, mode="constant", cval=-modes.clip_mm)
     scale = np.sum(modes.modes.astype(float) ** 2, axis=0)
     return surface_at(modes, np.asarray(modes.modes.T @ (field - modes.mean) / scale, float))

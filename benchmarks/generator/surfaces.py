@@ -13,8 +13,8 @@ from model.bundle import ShapeModel
 from model.geometry import Pose
 from model.inference.mesh import Mesh, area_cm2, components, mesh_of, vertex_areas, volume_ml
 from model.inference.surface import surface_of
-from training.baselines.distance import signed_distance
 from training.cohorts.cohort import Case
+from training.distance import signed_distance
 
 #: Points of a surface, and directions of its support function.
 POINTS, DIRECTIONS = 400, 64

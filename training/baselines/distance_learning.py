@@ -11,9 +11,10 @@ from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
 from model.geometry import Grid
-from training.baselines.distance import signed_distance
 from training.baselines.distance_modes import DistanceModes
 from training.cohorts.cohort import Case
+from training.distance import signed_distance
+from training.placing import centroid, reach_with_voxels
 from training.points import cuts_are_ends, window
 
 #: Modes beyond this share of the variance are not kept, nor more than so many.
@@ -43,30 +44,20 @@ def learn_modes(cases: Sequence[Case], clip_mm: float) -> DistanceModes:
 
 def canonical_grid(cases: Sequence[Case]) -> Grid:
     """Grid around the origin that holds every shape, moved onto its centroid, and `MARGIN_MM` more."""
-    reach = np.max([_reach(case) for case in cases], axis=0)
-    step = float(np.clip(reach.max() / STEPS_IN_EXTENT, *STEP_RANGE_MM))
-    half = np.ceil((reach + MARGIN_MM) / step).astype(int)
+    reaches = np.max([reach_with_voxels(case.mask, case.grid) for case in cases], axis=0)
+    step = float(np.clip(reaches.max() / STEPS_IN_EXTENT, *STEP_RANGE_MM))
+    half = np.ceil((reaches + MARGIN_MM) / step).astype(int)
     affine = np.diag([step, step, step, 1.0])
     affine[:3, 3] = -half * step
     a, b, c = (int(2 * count + 1) for count in half)
     return Grid((a, b, c), affine)
 
 
-def centroid(case: Case) -> Float[np.ndarray, "3"]:
-    """Centre of a mask's foreground (world mm)."""
-    return np.asarray(case.grid.to_world(np.argwhere(case.mask).astype(float)).mean(axis=0))
-
-
-def _reach(case: Case) -> Float[np.ndarray, "3"]:
-    world = case.grid.to_world(np.argwhere(case.mask).astype(float))
-    return np.asarray(np.abs(world - world.mean(axis=0)).max(axis=0) + case.grid.spacing.max() / 2)
-
-
 def _field(case: Case, grid: Grid, clip_mm: float, *, cut_is_end: bool) -> Float[np.ndarray, "v"]:
     """Clipped signed distance of a mask on the canonical grid, single precision."""
     found = window(case, clip_mm, cut_is_end=cut_is_end)
     distance = np.clip(signed_distance(found.mask, found.grid.spacing), -clip_mm, clip_mm)
-    index = found.grid.to_index(grid.centres() + centroid(case))
+    index = found.grid.to_index(grid.centres() + centroid(case.mask, case.grid))
     field = map_coordinates(distance, index.T, order=1, mode="constant", cval=-clip_mm)
     return np.asarray(field, np.float32)
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from model.errors import InconsistentStacks, InvalidMask
 from model.geometry import COINCIDENCE_TOLERANCE_MM, Grid
 from model.inference.observations import MaskStack, Plane
-from training.baselines.distance import signed_distance
+from training.distance import signed_distance
 
 
 def signed_distance_interpolation(stack: MaskStack, planes: Sequence[Plane], target: Grid) -> Bool[np.ndarray, "i j k"]:

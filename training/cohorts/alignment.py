@@ -18,9 +18,10 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from model.geometry import Grid
-from training.baselines.distance import signed_distance
 from training.cohorts.cohort import Case, Cohort
 from training.cohorts.inspect import bounding_box
+from training.distance import signed_distance
+from training.placing import centroid, inner_points
 
 #: Voxels along the longest side of the grid on which shapes are compared, and room around them (share of a half side).
 SIDE, ROOM = 40, 1.3
@@ -132,7 +133,7 @@ def likely_start(shape: Placed, mean: Float[np.ndarray, "i j k"], common: Grid) 
 
 def _axes(inside: Bool[np.ndarray, "i j k"], grid: Grid) -> Float[np.ndarray, "3 3"]:
     """Principal axes in the world as columns, right-handed."""
-    world = grid.to_world(np.argwhere(inside).astype(float))
+    world = inner_points(inside, grid)
     axes = np.linalg.svd(np.cov(world.T))[0]
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     return np.asarray(axes)
@@ -180,19 +181,15 @@ def _placed(case: Case) -> Placed:
     pad = np.ceil(0.35 * (sides * case.grid.spacing).max() / case.grid.spacing).astype(int)
     pad = np.maximum(pad, LEAST_PAD)
     field = signed_distance(np.pad(case.mask[box], [(int(width), int(width)) for width in pad]), case.grid.spacing)
-    world = case.grid.to_world(np.argwhere(case.mask).astype(float))
-    centroid = world.mean(axis=0)
+    middle = centroid(case.mask, case.grid)
     affine = case.grid.affine.astype(float).copy()
-    affine[:3, 3] = case.grid.to_world((np.array([side.start for side in box]) - pad)[None].astype(float))[0] - centroid
-    return Placed(field, Grid((field.shape[0], field.shape[1], field.shape[2]), affine), centroid)
+    affine[:3, 3] = case.grid.to_world((np.array([side.start for side in box]) - pad)[None].astype(float))[0] - middle
+    return Placed(field, Grid((field.shape[0], field.shape[1], field.shape[2]), affine), middle)
 
 
 def _common_grid(shapes: Sequence[Placed]) -> Grid:
     """Cube of isotropic voxels about the origin that holds every shape, however it is turned."""
-    reaches = [
-        np.linalg.norm(shape.grid.to_world(np.argwhere(shape.field > 0).astype(float)), axis=1).max()
-        for shape in shapes
-    ]
+    reaches = [np.linalg.norm(inner_points(shape.field > 0, shape.grid), axis=1).max() for shape in shapes]
     half = ROOM * float(np.max(reaches))
     step = 2.0 * half / (SIDE - 1)
     affine = np.diag([step, step, step, 1.0])

@@ -219,7 +219,7 @@ def _sorted_extent(case: Case) -> Float[np.ndarray, "3"]:
 
 def _extent(mask: Bool[np.ndarray, "i j k"], grid: Grid) -> Float[np.ndarray, "3"]:
     sizes = [side.stop - side.start for side in bounding_box(mask)]
-    return np.array(sizes) * grid.spacing
+    return np.asarray(np.array(sizes) * grid.spacing)
 
 
 def _words(values: Float[np.ndarray, "m"]) -> str:

@@ -11,6 +11,7 @@ from model.geometry import CanonicalLattice
 from model.inference.completion.drawn import drawn_at
 from training.cohorts.cohort import Case
 from training.completion.drawings import random_drawing
+from training.placing import centroid, reach
 from training.points import Window, cuts_are_ends, window
 
 #: SDs of the place of the origin (mm), as far as fits are off, and of the entries of a linear map of the shape.
@@ -46,11 +47,11 @@ def windows_of(cases: Sequence[Case]) -> list[Window]:
 
 def lattice_for(windows: Sequence[Window], most_voxels: int, least_step_mm: float, multiple: int) -> CanonicalLattice:
     """The finest lattice of so many voxels at most that holds most training shapes around their centroids."""
-    reaches = np.array([_reach(found) for found in windows])
+    reaches = np.array([reach(found.mask, found.grid) for found in windows])
     half = np.quantile(reaches, HELD_SHARE, axis=0) + ROOM_MM
     step = least_step_mm
     while True:
-        i, j, k = (int(multiple * np.ceil(2.0 * reach / step / multiple)) for reach in half)
+        i, j, k = (int(multiple * np.ceil(2.0 * size / step / multiple)) for size in half)
         if i * j * k <= most_voxels or max(i, j, k) == multiple:
             return CanonicalLattice((i, j, k), round(step, 3))
         step *= COARSER
@@ -68,7 +69,7 @@ def random_sample(
     linear = np.eye(3) + BENT * rng.standard_normal((3, 3))
     if mirrored:
         linear[:, 0] *= -1.0
-    centre = _centroid(found) + PLACED_MM * rng.standard_normal(3)
+    centre = centroid(found.mask, found.grid) + PLACED_MM * rng.standard_normal(3)
     world = lattice.points() @ linear.T + centre
     index = found.grid.to_index(world).T
     inside = map_coordinates(found.mask.astype(np.float32), index, order=1, mode="constant")
@@ -78,12 +79,3 @@ def random_sample(
     known[within] = ~found.unknown[tuple(nearest[:, within])]
     drawn = drawn_at(world, lattice.step_mm / 2.0, drawing.stacks, drawing.planes)
     return Sample(drawn.reshape(2, *lattice.voxels), inside.reshape(lattice.voxels), known.reshape(lattice.voxels))
-
-
-def _centroid(found: Window) -> Float[np.ndarray, "3"]:
-    return np.asarray(found.grid.to_world(np.argwhere(found.mask).astype(float)).mean(axis=0))
-
-
-def _reach(found: Window) -> Float[np.ndarray, "3"]:
-    world = found.grid.to_world(np.argwhere(found.mask).astype(float))
-    return np.asarray(np.abs(world - world.mean(axis=0)).max(axis=0))

@@ -3,13 +3,13 @@ import pytest
 
 from model.geometry import Grid, Pose
 from tests.analytic_shapes import Ellipsoid
-from training.baselines.distance import signed_distance
 from training.baselines.distance_choice import kept, score, spread
 from training.baselines.distance_fit import FitSettings, ModeFit, filled, fit_modes
 from training.baselines.distance_learning import learn_modes
 from training.baselines.distance_modes import DistanceModes, sampled
 from training.baselines.kept_modes import digest_of, read_chosen
 from training.cohorts import Case, Cohort, Provenance
+from training.distance import signed_distance
 from training.metrics_masks import dice
 from training.oblique import in_one_stack, random_planes
 from training.sparsify import for_evaluation
