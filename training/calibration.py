@@ -24,7 +24,7 @@ from model.inference.uncertainty import sharpness_of
 from training.answerable import answerable_cases, answerable_drawings, naming
 from training.cohorts.cohort import Case, Cohort, evenly
 from training.config import Regime
-from training.evaluate import surface_distance
+from training.evaluate import reconstruction_error_mm
 from training.oblique import SliceStacks
 from training.posterior_scale import posterior_scale
 from training.probability_scale import as_facts, best_scale, cross_entropies
@@ -157,7 +157,7 @@ def with_share(model: ShapeModel, cases: Sequence[Case], advance: Advance = lamb
     for share in SHARES:
         trial = counting(model, share)
         distances[share] = float(
-            np.mean([surface_distance(trial, case, regime) for case in chosen for regime in drawings_of(case)])
+            np.mean([reconstruction_error_mm(trial, case, regime) for case in chosen for regime in drawings_of(case)])
         )
         advance()
     best = min(share for share in SHARES if distances[share] <= (1.0 + TIE) * min(distances.values()))

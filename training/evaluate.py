@@ -176,7 +176,7 @@ def fills_of(model: ShapeModel, seed: int) -> dict[Method, Fill]:
     }
 
 
-def surface_distance(model: ShapeModel, case: Case, regime: Regime, *, seed: int = 0) -> float:
+def reconstruction_error_mm(model: ShapeModel, case: Case, regime: Regime, *, seed: int = 0) -> float:
     """Average surface distance (mm) of the reconstruction of one drawing from the dense mask.
 
     Raises:

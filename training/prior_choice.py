@@ -20,7 +20,7 @@ from training.answerable import answerable_cases, answerable_drawings
 from training.calibration import PRECISIONS, Advance, with_precision
 from training.cohorts.cohort import Case, evenly, listed
 from training.config import Regime
-from training.evaluate import surface_distance
+from training.evaluate import reconstruction_error_mm
 from training.pruning import PriorParts
 from training.release import trial_model
 from training.runs import mask_digest, read_record
@@ -135,4 +135,6 @@ def _errors(
     """Average surface distance (mm) of each case at a likelihood precision (1/mm^2), mean over its drawings."""
     trial = with_precision(model, precision)
     drawn = [(case, answerable_drawings(case, regimes)) for case in cases]
-    return np.array([np.mean([surface_distance(trial, case, regime) for regime in found]) for case, found in drawn])
+    return np.array(
+        [np.mean([reconstruction_error_mm(trial, case, regime) for regime in found]) for case, found in drawn]
+    )

@@ -20,7 +20,7 @@ from training.calibration import (
     with_sound_drawings,
 )
 from training.cohorts.cohort import Case
-from training.evaluate import surface_distance
+from training.evaluate import reconstruction_error_mm
 from training.sparsify import REGIMES
 from training.usual import sound_drawings
 
@@ -78,4 +78,4 @@ def test_an_error_says_of_which_shape_and_drawing_it_is():
     ):
         raise InvalidMask("two planes are needed", part="mask[0]")
     with pytest.raises(CohortError, match=r"slab: its drawing \(thin\)"):
-        surface_distance(MODEL, slab(1), "thin")
+        reconstruction_error_mm(MODEL, slab(1), "thin")
