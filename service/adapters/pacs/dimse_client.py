@@ -56,11 +56,7 @@ class DimseArchive:
 
     def lacking(self, objects: Sequence[Dataset]) -> list[Dataset]:
         """Those of the objects that a query does not find; all, when an archive that commits itself takes no query."""
-        with self._associated([sop_classes.VERIFICATION, sop_classes.FIND]) as peer:
-            accepted = {context.abstract_syntax for context in peer.accepted_contexts}
-            if self.commits and sop_classes.FIND not in accepted:
-                return list(objects)
-            return [found for found in objects if not self._finds(peer, found)]
+        return [found for found in objects if not self._holds(found)]
 
     def ask_commitment(self, objects: Sequence[Dataset], transaction: str) -> None:
         """N-ACTION; the archive reports later, to the listener."""
@@ -115,12 +111,15 @@ class DimseArchive:
                 ending = _last(peer.send_c_move(query, target.ae_title, sop_classes.MOVE))
         return _retrieval(found, ending)
 
-    def _finds(self, peer: Any, found: Dataset) -> bool:
+    def _holds(self, found: Dataset) -> bool:
+        """Asked for in an association of its own: between two queries the library's reader may take an answer away."""
         query = Dataset()
         query.QueryRetrieveLevel = "IMAGE"
         for name in ("StudyInstanceUID", "SeriesInstanceUID", "SOPInstanceUID"):
             setattr(query, name, found[name].value)
-        return self._matches(peer, query)
+        with self._associated([sop_classes.VERIFICATION, sop_classes.FIND]) as peer:
+            is_refused = sop_classes.FIND not in {context.abstract_syntax for context in peer.accepted_contexts}
+            return not (self.commits and is_refused) and self._matches(peer, query)
 
     def _matches(self, peer: Any, query: Dataset) -> bool:
         answers = list(peer.send_c_find(query, sop_classes.FIND))  # to the last, or the next query meets the rest
