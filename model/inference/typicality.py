@@ -25,6 +25,9 @@ from model.inference.reliability import MOST_USUAL_PLANES, Figures, usual_share
 
 #: Below this percentile a shape is called unlike the population; below the other when it is by the density alone.
 ATYPICAL_PERCENTILE, ATYPICAL_BY_DENSITY = 0.5, 1.0
+#: Of a model that was not calibrated, and has fewer training codes, it is not said: few shapes are learned by heart,
+#: and most others have codes less probable than any of theirs.
+FEWEST_CODES = 50
 #: A slice is told of when sound drawings would disagree as much with so small a probability.
 SURPRISING = 1e-3
 
@@ -63,8 +66,10 @@ def typicality(model: ShapeModel, found: Fit, figures: Figures) -> tuple[float, 
 
 def typicality_warnings(model: ShapeModel, percentile: float) -> tuple[str, ...]:
     """What to tell about a shape that the model does not know."""
-    limit = ATYPICAL_PERCENTILE if model.manifest.typical else ATYPICAL_BY_DENSITY
-    if percentile >= limit:
+    is_calibrated = bool(model.manifest.typical)
+    if not is_calibrated and len(model.population.log_densities) < FEWEST_CODES:
+        return ()
+    if percentile >= (ATYPICAL_PERCENTILE if is_calibrated else ATYPICAL_BY_DENSITY):
         return ()
     return ("The shape is unlike the population that the model was trained on; do not rely on it.",)
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from model.bundle import Population
 from model.errors import InvalidMask, InvalidParameter, TooLarge
 from model.geometry import Grid, Pose
 from model.inference.mesh import area_cm2, is_watertight, volume_ml
@@ -277,6 +278,15 @@ def test_a_shape_unlike_the_population_is_warned_of(axes):
     answer = reconstructed(drawn(ellipsoid, cube_around(CENTRE, step=1.5)), annotated=ORTHOGONAL)
     assert answer.typicality_percentile < ATYPICAL_BY_DENSITY
     assert any("unlike the population" in sentence for sentence in answer.warnings)
+
+
+def test_a_model_of_few_shapes_that_was_not_calibrated_does_not_say_what_is_unlike_them():
+    known = MODEL.population
+    few = Population(known.codes[:16], known.base_codes[:16], known.log_densities[:16], known.volumes_ml[:16])
+    stack = drawn(Ellipsoid((24.0, 5.0, 13.0), CENTRE), cube_around(CENTRE, step=1.5))
+    answer = reconstructed(stack, replace(MODEL, population=few), annotated=ORTHOGONAL)
+    assert answer.typicality_percentile == 0.0
+    assert not any("unlike the population" in sentence for sentence in answer.warnings)
 
 
 def test_a_fit_that_does_not_converge_is_warned_of():
