@@ -12,22 +12,21 @@ import typer
 from jaxtyping import Bool, Float
 
 from model.bundle import ShapeModel, open_bundle
-from model.geometry import Grid
 from model.inference.fit_types import ThickRule
 from model.inference.mask_stack import MaskStack, Plane
 from model.inference.one_body import body_mask
 from model.inference.reconstruction import Options, reconstruct
+from training.answerable import LEAST_PLANES
 from training.cohort_options import DataOption
 from training.cohorts import CohortName, CohortOptions, data_folder, load_cohort
 from training.cohorts.cohort import Case, evenly
 from training.console import exit_status
 from training.evaluate import find_bundle, shipped_bundles
 from training.metrics_masks import agreement
-from training.sparsify import body_axes, centred_block, centred_offset
+from training.oblique import SliceStacks
+from training.sparsify import blocks_of, body_axes, centred_block, centred_offset, thick_grid
 
 THICKNESSES = (4, 5, 8)
-#: Planes that a drawing has at least.
-LEAST_PLANES = 2
 
 
 @dataclass(frozen=True)
@@ -47,44 +46,31 @@ class Answer:
     rule: ThickRule
 
 
-def drawn_by(rule: ThickRule, case: Case, count: int) -> tuple[MaskStack, tuple[Plane, ...]]:
+def drawn_by(rule: ThickRule, case: Case, count: int) -> SliceStacks:
     """A case on axial slices of so many voxels' thickness, centred in the object, and those that show some of it."""
-    axial = body_axes(case.grid)[2]
-    along = np.moveaxis(case.mask, axial, 0)
+    axial, middle = body_axes(case.grid)[2], count // 2
     is_section = rule == "section"
-    first = (
-        centred_offset(case.mask, axial, count) - count // 2 if is_section else centred_block(case.mask, axial, count)
-    )
-    first = first % count - (count if first % count else 0)
-    blocks = -(-(len(along) - first) // count)
-    padded = np.zeros((blocks * count, *along.shape[1:]), bool)
-    padded[-first : len(along) - first] = along
-    fine = padded.reshape(blocks, count, *along.shape[1:])
-    labels = np.moveaxis(fine[:, count // 2] if is_section else _filled(fine.mean(axis=1), rule), 0, axial)
-    centre = first + (count // 2 if is_section else (count - 1) / 2)
-    shown = np.flatnonzero(labels.any(axis=tuple(np.delete(np.arange(3), axial))))
-    stack = MaskStack("mask[0]", _thick_grid(case.grid, axial, centre, count, labels), labels, np.zeros_like(labels))
-    return stack, tuple(Plane(0, axial, int(index)) for index in shown)
+    first = centred_offset(case.mask, axial, count) - middle if is_section else centred_block(case.mask, axial, count)
+    start, fine = blocks_of(case.mask, axial, first, count)
+    labels = fine[:, middle] if is_section else _filled(fine.mean(axis=1), rule)
+    # A thick slice stands at the centre of its block, a section where it was taken.
+    begins = start + (middle - (count - 1) / 2 if is_section else 0.0)
+    shown = np.flatnonzero(labels.any(axis=(1, 2)))
+    labels = np.moveaxis(labels, 0, axial)
+    stack = MaskStack("mask[0]", thick_grid(case.grid, axial, begins, count, len(fine)), labels, np.zeros_like(labels))
+    return SliceStacks((stack,), tuple(Plane(0, axial, int(index)) for index in shown))
 
 
 def _filled(share: Float[np.ndarray, "n a b"], rule: ThickRule) -> Bool[np.ndarray, "n a b"]:
     return share > 0.5 if rule == "more than half" else share >= 0.5
 
 
-def _thick_grid(grid: Grid, axis: int, centre: float, count: int, labels: Bool[np.ndarray, "i j k"]) -> Grid:
-    affine, first = grid.affine.astype(float).copy(), np.zeros((1, 3))
-    first[0, axis] = centre
-    affine[:3, 3] = grid.to_world(first)[0]
-    affine[:3, axis] *= count
-    return Grid((labels.shape[0], labels.shape[1], labels.shape[2]), affine)
-
-
 def measure(model: ShapeModel, case: Case, rule: ThickRule, count: int) -> Answer | None:
     """The answer to a drawing; None where that has a single plane."""
-    stack, planes = drawn_by(rule, case, count)
-    if len(planes) < LEAST_PLANES:
+    drawing = drawn_by(rule, case, count)
+    if len(drawing.planes) < LEAST_PLANES:
         return None
-    found = reconstruct(model, [stack], Options(annotated=planes))
+    found = reconstruct(model, drawing.stacks, Options(annotated=drawing.planes))
     filled = body_mask(model, found.state, found.mesh, case.grid)
     volume, truth = found.volume_ml, case.volume_ml
     return Answer(

@@ -120,15 +120,23 @@ def thick(
     the axial spacing, and its slices stand at the centres of the blocks.
     """
     axial = body_axes(grid)[2]
-    start = offset % every - (every if offset % every else 0)
-    blocks = -(-(mask.shape[axial] - start) // every)
-    padded = np.zeros((blocks * every, *np.delete(mask.shape, axial)), bool)
-    padded[-start : mask.shape[axial] - start] = np.moveaxis(mask, axial, 0)
-    averaged = padded.reshape(blocks, every, *padded.shape[1:]).mean(axis=1) >= 0.5
-    coarse = np.moveaxis(averaged, 0, axial)
+    start, fine = blocks_of(mask, axial, offset, every)
+    averaged = fine.mean(axis=1) >= 0.5
     occupied = averaged.any(axis=(1, 2))
-    chosen = [(axial, index) for index in range(blocks) if empty_slices or occupied[index]]
-    return _draw(coarse, _thick_grid(grid, axial, start, every, blocks), chosen)
+    chosen = [(axial, index) for index in range(len(averaged)) if empty_slices or occupied[index]]
+    return _draw(np.moveaxis(averaged, 0, axial), thick_grid(grid, axial, start, every, len(averaged)), chosen)
+
+
+def blocks_of(
+    mask: Bool[np.ndarray, "i j k"], axis: int, offset: int, every: int
+) -> tuple[int, Bool[np.ndarray, "n e a b"]]:
+    """First slice (0 or less) of the first block, and the slices of all, ``every`` each; one begins at ``offset``."""
+    along = np.moveaxis(mask, axis, 0)
+    start = offset % every - (every if offset % every else 0)
+    blocks = -(-(len(along) - start) // every)
+    padded = np.zeros((blocks * every, *along.shape[1:]), bool)
+    padded[-start : len(along) - start] = along
+    return start, padded.reshape(blocks, every, *along.shape[1:])
 
 
 def orthogonal(mask: Bool[np.ndarray, "i j k"], grid: Grid, indices: tuple[int, int, int]) -> Drawing:
@@ -193,7 +201,8 @@ def _draw(mask: Bool[np.ndarray, "i j k"], grid: Grid, chosen: list[tuple[int, i
     return Drawing(stack, tuple(Plane(0, axis, index) for axis, index in chosen))
 
 
-def _thick_grid(grid: Grid, axis: int, start: int, every: int, blocks: int) -> Grid:
+def thick_grid(grid: Grid, axis: int, start: float, every: int, blocks: int) -> Grid:
+    """The grid of slices ``every`` times as thick along an axis, the first of which begins with slice ``start``."""
     centre = np.zeros((1, 3))
     centre[0, axis] = start + (every - 1) / 2
     affine = grid.affine.astype(float).copy()

@@ -4,8 +4,8 @@ Who draws on an image outlines what fills half of the slice's thickness. Masks o
 the section at the slice's centre. Averages of an even number of fine slices, as thick as voxels are wide, have columns
 of which exactly half is filled: foreground where at least half was asked for, background where more than half was. The
 ends of the object lie half a fine slice apart between these, which is 15 % of a hippocampus' volume on slices of 4 mm,
-and no header tells which it was. So the fit goes on under each, and the drawing decides: the rule under which it is
-most probable is kept.
+and no header tells which it was. So the fit goes on under each, and the drawing decides: of the posterior over the
+rules the median is taken, and what it leaves open is told.
 
 Under each rule one fine slice of a column decides: that at the centre, the median, or the one of an even number's two
 in the middle that lets ties in or keeps them out. Each observation is placed there, found at the current fit, and the
@@ -61,27 +61,29 @@ class Columns:
         return replace(self, vectors=self.vectors[chosen], widths_mm=self.widths_mm[chosen])
 
     @property
+    def voxels(self) -> Float[np.ndarray, "n"]:
+        """Thickness in widths of a voxel; 0 where the slice is not thick."""
+        return np.asarray(np.linalg.norm(self.vectors, axis=1) / self.widths_mm)
+
+    @property
     def rules(self) -> tuple[ThickRule, ...]:
         """Rules that the slices may have been drawn by; none where no slice is thick."""
-        halves = np.linalg.norm(self.vectors, axis=1) / self.widths_mm / 2.0
-        if not halves.any():
+        pairs = self.voxels[self.voxels > 0.0] / 2.0
+        if not pairs.size:
             return ()
-        even = (halves > 0.0) & (np.abs(halves - np.rint(halves)) < EVEN_WITHIN)
+        even = np.abs(pairs - np.rint(pairs)) < EVEN_WITHIN
         return COMMON_RULES + (EVEN_RULES if even.any() else ())
 
     @property
     def halves_mm(self) -> Float[np.ndarray, "k 3"]:
         """Half a fine slice along the normal of each direction of thick slices (world mm)."""
-        thickness = np.linalg.norm(self.vectors, axis=1)
-        thick = thickness > 0.0
-        scales = self.widths_mm[thick] / thickness[thick] / 2.0
-        return np.unique(np.round(self.vectors[thick] * scales[:, None], 6), axis=0)
+        thick = self.voxels > 0.0
+        return np.unique(np.round(self.vectors[thick] / (2.0 * self.voxels[thick, None]), 6), axis=0)
 
     @property
     def counts(self) -> Int[np.ndarray, "n"]:
         """Of how many fine slices one decides: the centre alone on thin slices, an odd number where none can tie."""
-        counts = np.rint(np.linalg.norm(self.vectors, axis=1) / self.widths_mm).astype(int)
-        counts = np.clip(counts, 1, MOST_SLICES)
+        counts = np.clip(np.rint(self.voxels).astype(int), 1, MOST_SLICES)
         match self.rule:
             case "section":
                 return np.ones_like(counts)
