@@ -14,13 +14,8 @@ import numpy as np
 
 from model.bundle import ShapeModel
 from model.inference.discrepancy.conditioning import DiscrepancyPrior
-from model.inference.posterior import (
-    fitted_jacobians,
-    laplace_covariance,
-    logit_variance,
-    mean_probability,
-    open_variance,
-)
+from model.inference.posterior import fitted_jacobians, laplace_covariance, mean_probability, open_variance
+from model.inference.uncertainty import settled_variance
 from training.scored_drawing import ScoredDrawing
 
 #: Spreads (mm) and factors that are tried.
@@ -68,12 +63,12 @@ def _scores(model: ShapeModel, drawing: ScoredDrawing) -> Iterator[tuple[Probabi
     """The spread scales the variance of the discrepancy and leaves its mean."""
     fidelity = model.manifest.discrepancy["fidelity"]
     found = drawing.corrected(model, DiscrepancyPrior(1.0, fidelity))
-    logits, by_parameter, _ = fitted_jacobians(model, found, drawing.points)
-    of_parameters = logit_variance(by_parameter, laplace_covariance(found))
+    logits, *derivatives = fitted_jacobians(model, found, drawing.points)
+    of_fit = settled_variance(found, laplace_covariance(found), *derivatives)
     of_discrepancy = open_variance(found, drawing.points)
     of_truth = np.where(drawing.truth, logits, -logits)
     for spread in SPREADS_MM:
-        variance = of_parameters + spread**2 * of_discrepancy
+        variance = of_fit + spread**2 * of_discrepancy
         for sharpness in SHARPNESSES:
             said = mean_probability(of_truth, variance, sharpness).astype(float)
             yield ProbabilityScale(spread, sharpness), float(-np.log(np.maximum(said, LEAST_DOUBT)).mean())

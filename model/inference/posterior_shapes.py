@@ -1,7 +1,8 @@
 """Shapes drawn from the posterior of one reconstruction: code, pose and discrepancy together.
 
 A draw of code and pose comes from the Laplace posterior; the contours then hold the surface as they hold the fit's, so
-the discrepancy is observed anew at them and a draw of it added. An ensemble's draws are its members.
+the discrepancy is observed anew at them and a draw of it added. An ensemble's draws are its members. Of either the ends
+move as far as the rule is open by which thick slices were drawn.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from model.inference.fitting import Fit
 from model.inference.mesh import Mesh
 from model.inference.objective import Place
 from model.inference.surface import surface_of
-from model.inference.uncertainty import ShapeState, calibrated_scale
+from model.inference.uncertainty import ShapeState, calibrated_scale, end_moves
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,9 @@ def draw_posterior(model: ShapeModel, state: ShapeState, seed: int, step_mm: flo
     """
     chosen, shift_mm = (_member(state, seed), 0.0) if state.members else _around(model, state, seed)
     mesh = surface_of(model, chosen.latent, chosen.pose, step_mm, chosen.discrepancy)
-    return PosteriorShape(chosen, replace(mesh, vertices=mesh.vertices + shift_mm * mesh.normals) if shift_mm else mesh)
+    ends = end_moves(state.fits[0], mesh.normals)
+    moved_mm = shift_mm + ends @ np.random.default_rng([seed, 1]).standard_normal(ends.shape[1])
+    return PosteriorShape(chosen, replace(mesh, vertices=mesh.vertices + moved_mm[:, None] * mesh.normals))
 
 
 def _member(state: ShapeState, seed: int) -> Fit:

@@ -83,12 +83,21 @@ def surface_spread(
         moves = member_moves(model, found, state.members, mesh, known)
         factors = (moves - moves.mean(axis=1, keepdims=True)) / np.sqrt(len(state.members) - 1)
     shared = np.full((len(canonical), 1), offset_mm, factors.dtype)
-    return SurfaceSpread(np.concatenate([factors, shared, *_ends(found, mesh)], axis=1), local)
+    return SurfaceSpread(np.concatenate([factors, shared, end_moves(found, mesh.normals)], axis=1), local)
 
 
-def _ends(found: Fit, mesh: Mesh) -> list[Float[np.ndarray, "v k"]]:
-    """Outward movements (mm) where it is not known by what rule thick slices were drawn: both ends move in or out."""
-    return [] if found.thick_doubt is None else [np.abs(mesh.normals @ found.thick_doubt.T).astype(np.float32)]
+def end_moves(found: Fit, across: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n t"]:
+    """What is open because it is not known by what rule thick slices were drawn: both ends move out, or both in.
+
+    Args:
+        across: normals of a surface, or gradients of a field, at points (world).
+
+    Returns:
+        Outward movements (mm), or changes of the field, for an SD of each direction's rule; none without thick slices.
+    """
+    if found.thick_doubt is None:
+        return np.zeros((len(across), 0), np.float32)
+    return np.asarray(np.abs(across @ found.thick_doubt.T), np.float32)
 
 
 def calibrated_scale(model: ShapeModel) -> tuple[float, float]:
@@ -163,10 +172,25 @@ def _piece(model: ShapeModel, state: ShapeState, points: Float[np.ndarray, "n 3"
     result = _sigmoid(logits)
     if state.covariance is not None and is_open.any():
         near = points[is_open]
-        centre, by_parameter, _ = fitted_jacobians(model, found, near)
-        variance = logit_variance(by_parameter, state.covariance) + open_variance(found, near)
+        centre, by_parameter, by_point = fitted_jacobians(model, found, near)
+        variance = settled_variance(found, state.covariance, by_parameter, by_point) + open_variance(found, near)
         result[is_open] = mean_probability(centre, variance, sharpness_of(model))
     return result
+
+
+def settled_variance(
+    found: Fit,
+    covariance: Float[np.ndarray, "p p"],
+    by_parameter: Float[np.ndarray, "n p"],
+    by_point: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, "n"]:
+    """Posterior variance of each logit by code and pose, and by the rule of thick slices: all but the discrepancy's.
+
+    Args:
+        by_parameter, by_point: derivatives of the logits as `fitted_jacobians` gives them.
+    """
+    by_rule = np.square(end_moves(found, by_point)).sum(axis=1)
+    return np.asarray(logit_variance(by_parameter, covariance) + by_rule)
 
 
 def _logits(

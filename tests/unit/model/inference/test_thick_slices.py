@@ -9,10 +9,12 @@ from hypothesis import strategies as st
 
 from model.geometry import Grid
 from model.inference.discrepancy.conditioning import DiscrepancyPrior, discrepancy_of
+from model.inference.estimates import sd_of_estimate
 from model.inference.fitting import FitOptions, fit
 from model.inference.mesh import volume_ml
 from model.inference.observations import MaskStack, find_planes, observe
 from model.inference.posterior import model_logits
+from model.inference.posterior_shapes import draw_posterior
 from model.inference.reconstruction import Options, reconstruct
 from model.inference.thick_slices import (
     EVEN_RULES,
@@ -24,6 +26,7 @@ from model.inference.thick_slices import (
     settled_under,
     through_thickness,
 )
+from model.inference.uncertainty import occupancy
 from tests.analytic_model import MEAN_AXES, SPREAD, ellipsoid_model
 from tests.analytic_shapes import Ellipsoid
 from tests.drawn_shapes import PARALLEL, cube_around, drawn
@@ -209,6 +212,33 @@ def test_a_rule_that_the_drawing_does_not_tell_makes_intervals_wider():
     doubt = answer.state.fits[0].thick_doubt
     np.testing.assert_allclose(doubt[:, :2], 0.0, atol=1e-6)
     assert 0.1 < np.abs(doubt[0, 2]) < 0.6
+
+
+def test_draws_are_as_open_as_the_interval_where_the_rule_is():
+    answer = reconstruct(MODEL, [thick_stack(4, 44, "half")], Options(annotated="nonempty"))
+    sure = replace(answer.state, fits=(replace(answer.state.fits[0], thick_doubt=None),))
+    open_ml, narrow_ml = (
+        np.std([volume_ml(draw_posterior(MODEL, state, seed, 2.0).mesh) for seed in range(24)])
+        for state in (answer.state, sure)
+    )
+    assert open_ml == pytest.approx(sd_of_estimate(answer.volume_ml), rel=0.35)
+    assert narrow_ml < 0.75 * open_ml
+
+
+def test_voxels_beyond_the_ends_are_as_open_as_the_rule_is():
+    answer = reconstruct(MODEL, [thick_stack(4, 44, "half")], Options(annotated="nonempty"))
+    sure = replace(answer.state, fits=(replace(answer.state.fits[0], thick_doubt=None),))
+    beyond = np.diag(TRUTH.semi_axes + np.array([1.0, 1.0, 1.0]))
+    grid = Grid((2, 1, 1), cube_around(CENTRE).affine)
+
+    def at(state, place):
+        affine = grid.affine.copy()
+        affine[:3, 3] = CENTRE + place
+        return occupancy(MODEL, state, replace(grid, affine=affine))[0, 0, 0]
+
+    side, _, end = ((at(answer.state, place), at(sure, place)) for place in beyond)
+    assert end[0] > 1.2 * end[1] > 0.0
+    assert side[0] == pytest.approx(side[1], rel=0.05)
 
 
 def test_no_doubt_of_the_rule_where_none_would_move_the_ends():
