@@ -10,8 +10,8 @@ with position ``t`` (mm, where the canonical origin lies in the world), rotation
 log scale ``s`` and ``F = diag(-1, 1, 1)`` for mirrored anatomy, identity otherwise.
 """
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -76,6 +76,16 @@ class Grid:
         corners = np.array([[0, 0, 0], last, [last[0], 0, 0], [0, last[1], 0]])
         gap = np.abs(self.to_world(corners) - other.to_world(corners)).max()
         return bool(gap <= COINCIDENCE_TOLERANCE_MM)
+
+
+AnyGrid = TypeVar("AnyGrid", bound=Grid)
+
+
+def slab(grid: AnyGrid, first: int, last: int) -> AnyGrid:
+    """The planes of a grid from one index along its last axis to another, both included."""
+    affine = grid.affine.copy()
+    affine[:3, 3] += first * grid.affine[:3, 2]
+    return replace(grid, shape=(*grid.shape[:2], last - first + 1), affine=affine)
 
 
 @dataclass(frozen=True)

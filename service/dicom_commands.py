@@ -1,5 +1,6 @@
 """The commands ``deidentify``, ``audit`` and ``resend``."""
 
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,7 +20,7 @@ from service.stores import open_blobs, open_jobs
 from service.wiring import image_limits
 
 if TYPE_CHECKING:
-    from service.adapters.dicom.deidentification import LeftOut
+    from service.adapters.dicom.deidentification import LabelMap, LeftOut, StudyFile
     from service.adapters.pacs.inbox import Inbox
 
 
@@ -30,11 +31,28 @@ class LeftOutFile(BaseModel):
     reason: str
 
 
+class LabelledStructure(BaseModel):
+    """A segment or region in a label map."""
+
+    value: int = Field(description="Of its voxels.")
+    number: int = Field(description="Segment or ROI number in the drawing.")
+    meaning: str = Field(description="Of its code; empty without one.")
+
+
+class WrittenLabelMap(BaseModel):
+    """A label map, and which of its values is which segment or region."""
+
+    file: str = Field(description="Path below the folder that was written.")
+    drawing: str = Field(description="Path of the drawing there.")
+    structures: list[LabelledStructure]
+
+
 class DeidentifiedStudy(BaseModel):
     """What became of a study."""
 
     objects: int = Field(description="Objects without identifiers that were written.")
-    label_maps: int = Field(description="Drawings that were written as label maps.")
+    label_maps: int = Field(description="Label maps that were written.")
+    masks: list[WrittenLabelMap] = Field(description="What the values of each label map are.")
     unused_files: list[LeftOutFile] = Field(description="DICOM files that cannot be used.")
     unused_drawings: list[LeftOutFile] = Field(description="Drawings without a label map.")
 
@@ -68,28 +86,53 @@ def deidentify(
 
 def _deidentify(study: Path, output: Path, limits: ImageLimits) -> DeidentifiedStudy:
     """Write what can be used; the folder is made with the first object."""
-    from service.adapters.dicom import deidentification
-    from service.adapters.dicom.deidentification import LeftOut, StudyFile
+    kept, originals, unused = _write_objects(study, output)
+    masks, undrawn = _write_masks(kept, originals, output, limits)
+    return DeidentifiedStudy(
+        objects=len(kept), label_maps=len(masks), masks=masks, unused_files=unused, unused_drawings=undrawn
+    )
+
+
+def _write_objects(study: Path, output: Path) -> tuple[list["StudyFile"], dict[str, str], list[LeftOutFile]]:
+    """Objects by the names that they were written under, those that they had, and the files that were left out."""
+    from service.adapters.dicom.deidentification import LeftOut, StudyFile, cleared, read_study
 
     kept: list[StudyFile] = []
+    originals: dict[str, str] = {}
     unused: list[LeftOutFile] = []
-    undrawn: list[LeftOutFile] = []
-    maps = 0
-    for found in deidentification.read_study(study):
-        data = deidentification.cleared(found) if isinstance(found, StudyFile) else found
+    for found in read_study(study):
+        data = cleared(found) if isinstance(found, StudyFile) else found
         if isinstance(data, LeftOut):
             unused.append(_schema(data))
         elif isinstance(found, StudyFile):
-            _write(output / "dicom" / f"{len(kept):06d}.dcm", data)
-            kept.append(found)
-    # Drawn from the objects as they were written, so that what refers to what is as in them.
-    for drawn in deidentification.label_maps(kept, limits):
+            name = f"dicom/{len(kept):06d}.dcm"
+            _write(output / name, data)
+            kept.append(StudyFile(name, found.content))
+            originals[name] = found.name
+    return kept, originals, unused
+
+
+def _write_masks(
+    kept: Sequence["StudyFile"], originals: Mapping[str, str], output: Path, limits: ImageLimits
+) -> tuple[list[WrittenLabelMap], list[LeftOutFile]]:
+    """Label maps of the objects as they were written, so that what refers to what is as in them; drawings without."""
+    from service.adapters.dicom.deidentification import LeftOut, label_maps
+
+    masks: list[WrittenLabelMap] = []
+    undrawn: list[LeftOutFile] = []
+    for drawn in label_maps(kept, limits):
         if isinstance(drawn, LeftOut):
-            undrawn.append(_schema(drawn))
+            undrawn.append(LeftOutFile(file=originals[drawn.name], reason=drawn.reason))
         else:
-            _write(output / "masks" / f"{maps:06d}.nii.gz", write_nifti(drawn.values, drawn.grid, "drawing"))
-            maps += 1
-    return DeidentifiedStudy(objects=len(kept), label_maps=maps, unused_files=unused, unused_drawings=undrawn)
+            name = f"masks/{len(masks):06d}.nii.gz"
+            _write(output / name, write_nifti(drawn.values, drawn.grid, "drawing"))
+            masks.append(_described(drawn, name))
+    return masks, undrawn
+
+
+def _described(drawn: "LabelMap", name: str) -> WrittenLabelMap:
+    structures = [LabelledStructure.model_validate(item, from_attributes=True) for item in drawn.structures]
+    return WrittenLabelMap(file=name, drawing=drawn.drawing, structures=structures)
 
 
 def _schema(found: "LeftOut") -> LeftOutFile:
@@ -104,7 +147,7 @@ def _write(path: Path, data: bytes) -> None:
 def _sentence(done: DeidentifiedStudy) -> str:
     left_out = [f"{len(done.unused_files)} files not used"] if done.unused_files else []
     left_out += [f"{len(done.unused_drawings)} drawings without a label map"] if done.unused_drawings else []
-    written = f"{done.objects} objects without identifiers, {done.label_maps} drawings as label maps"
+    written = f"{done.objects} objects without identifiers, {done.label_maps} label maps of drawings"
     return f"{', '.join([written, *left_out])}."
 
 

@@ -151,8 +151,8 @@ class SampleQuery(_Closed):
     spacing_mm: SpacingMm | None = Field(None, description="grid step (mm); the model's when left out")
     reject: bool = Field(
         True,
-        description="draw anew where a shape is implausible: several components, a volume out of range, cut by the border "
-        "of the model's box, without a surface, or between two clusters of training shapes",
+        description="draw anew where a shape is implausible: several components, a volume out of range, cut by the "
+        "border of the model's box, without a surface, or between two clusters of training shapes",
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 from pydicom import Dataset
 
 from service.adapters.dicom.results import RESULTS
-from service.adapters.pacs.inbox import OBJECT, QUARANTINE, REASON
+from service.adapters.pacs.inbox import ARGUMENT, INBOX, OBJECT, QUARANTINE, REASON
 from service.pacs_ports import Disposition
 from tests.analytic_model import MEAN_AXES
 from tests.analytic_shapes import Ellipsoid
@@ -56,7 +56,8 @@ def test_left_and_right_in_one_drawing_are_two_reconstructions(images, tmp_path)
     with archive.running(), service.working():
         service.until_empty()
         service.inbox.receive(file_bytes(drawing), "VIEWER")  # once more
-        assert service.inbox.backlog() == 0
+        assert service.inbox.backlog() == 2
+        service.until_empty()
     assert len(set(archive.stored)) == len(archive.stored) == 2 * len(RESULTS)
     names = [found.SegmentSequence[0].SegmentLabel for found in archive.results if "SegmentSequence" in found]
     assert sorted(names) == ["left hippocampus"] * 2 + ["right hippocampus"] * 2
@@ -76,19 +77,39 @@ def test_a_structure_that_cannot_be_used_keeps_back_no_other(images, tmp_path):
     blank = reread(framed)
     blank.SegmentSequence[1].SegmentLabel = "right"
     values = np.array(blank.pixel_array)
-    for number, frame in enumerate(blank.PerFrameFunctionalGroupsSequence):
-        if frame.SegmentIdentificationSequence[0].ReferencedSegmentNumber == 2:
-            values[number] = 0
+    frames = enumerate(blank.PerFrameFunctionalGroupsSequence)
+    right = [n for n, frame in frames if frame.SegmentIdentificationSequence[0].ReferencedSegmentNumber == 2]
+    drawn = [number for number in right if values[number].any()]
+    values[[number for number in right if number != drawn[0]]] = 0
     blank.PixelData = np.packbits(values.ravel().astype(bool), bitorder="little").tobytes()
     archive = FakeArchive(images)
     service = service_with(tmp_path, archive.settings())
     with archive.running(), service.working():
-        for _ in range(2):  # to send it again changes nothing, and is no second reconstruction of the other
+        for _ in range(2):  # to send it again changes nothing, and stores nothing of the other twice
             service.inbox.receive(file_bytes(blank), "VIEWER")
             service.until_empty()
             assert len(archive.stored) == len(RESULTS)
             (kept,) = [key for key in service.blobs.list(f"{QUARANTINE}/") if key.endswith(OBJECT)]
             told = json.loads(service.blobs.get(kept.replace(OBJECT, REASON)))
             assert told["segments"] == [2]
-            assert "draws nothing" in told["reason"]
+            assert "one slice only" in told["reason"]
     assert service.blobs.get(kept) == file_bytes(blank)
+    (name,) = service.inbox.in_quarantine()
+    service.inbox.send_again(name)  # the other is not in quarantine
+    (key,) = [key for key in service.blobs.list(f"{INBOX}/") if key.endswith(ARGUMENT)]
+    assert json.loads(service.blobs.get(key))["labels"] == [2]
+
+
+def test_an_empty_segment_is_no_structure(images, tmp_path):
+    pair = pair_on(images)
+    pair[..., 1] = 0
+    drawing = seg_of(images, pair, "LABELMAP", labels=("left", "right"))
+    archive = FakeArchive(images)
+    service = service_with(tmp_path, archive.settings())
+    with archive.running(), service.working():
+        service.inbox.receive(file_bytes(drawing), "VIEWER")
+        assert service.inbox.backlog() == 1
+        service.until_empty()
+    assert service.reasons() == []
+    assert len(archive.stored) == len(RESULTS)
+    assert not [found for found in archive.results if "#" in found.SeriesDescription]

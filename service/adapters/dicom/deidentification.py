@@ -16,11 +16,13 @@ from jaxtyping import UInt8
 from pydicom import Dataset
 from pydicom.dataset import FileMetaDataset
 from pydicom.sequence import Sequence as Items
-from pydicom.uid import PYDICOM_IMPLEMENTATION_UID, MediaStorageDirectoryStorage
+from pydicom.uid import PYDICOM_IMPLEMENTATION_UID, MediaStorageDirectoryStorage, RTStructureSetStorage
 
 from model.errors import InputError, InvalidMask, UnreadableImage
 from model.geometry import Grid
-from service.adapters.dicom.masks import DRAWINGS, referenced_series, stacks_of_object
+from model.inference.mask_stack import MaskStack
+from model.inference.stacks import EXCLUDED_VALUE
+from service.adapters.dicom.masks import DRAWINGS, referenced_series, stacks_by_label
 from service.adapters.dicom.objects import is_dicom, read_object, tolerant
 from service.adapters.dicom.profile import apply_profile
 from service.adapters.dicom.series import series_of
@@ -28,6 +30,9 @@ from service.adapters.image_guard import ImageLimits
 
 #: Code of the profile (PS3.16, CID 7050).
 PROFILE = ("113100", "DCM", "Basic Application Confidentiality Profile")
+
+#: Structures that one label map may hold: no reader takes their values for voxels that were not looked at.
+MOST_VALUES = EXCLUDED_VALUE - 1
 
 
 @dataclass(frozen=True)
@@ -51,11 +56,34 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
+class Structure:
+    """A segment or region in a label map.
+
+    Attributes:
+        value: of its voxels.
+        number: of the segment or region in the drawing.
+        meaning: that its code has; empty where it has none. What somebody called it is not told.
+    """
+
+    value: int
+    number: int
+    meaning: str
+
+
+@dataclass(frozen=True)
 class LabelMap:
-    """What a drawing drew, on the grid of its images: 1 is the object."""
+    """What a drawing drew, on the grid of its images.
+
+    Attributes:
+        values: those of the structures, 0 elsewhere.
+        structures: in the order of the drawing.
+        drawing: path of the drawing below the study's folder.
+    """
 
     values: UInt8[np.ndarray, "i j k"]
     grid: Grid
+    structures: tuple[Structure, ...]
+    drawing: str
 
 
 def read_study(folder: Path) -> Iterator[StudyFile | LeftOut]:
@@ -103,6 +131,7 @@ def without_identifiers(found: Dataset) -> Dataset:
         apply_profile(found)
         code = Dataset()
         code.CodeValue, code.CodingSchemeDesignator, code.CodeMeaning = PROFILE
+        found.LongitudinalTemporalInformationModified = "REMOVED"
         found.PatientIdentityRemoved, found.DeidentificationMethod = "YES", "PS3.15 Basic Profile, dicom-anonymizer"
         found.DeidentificationMethodCodeSequence = Items([code])
         meta = FileMetaDataset()
@@ -126,22 +155,86 @@ def cleared(file: StudyFile) -> bytes | LeftOut:
 
 
 def label_maps(study: Sequence[StudyFile], limits: ImageLimits) -> Iterator[LabelMap | LeftOut]:
-    """Each drawing of a study as a label map on its images' grid, or why there is none."""
+    """Each drawing of a study as label maps on its images' grid, or why there is none.
+
+    Segments or regions that do not overlap are the values 1, 2, ... of one label map, in the order of the drawing.
+    Where two of them share a voxel, or there are more than `MOST_VALUES`, each is the value 1 of its own.
+    """
     for drawing in study:
         if drawing.content.get("SOPClassUID") in DRAWINGS:
             try:
-                yield _label_map(drawing.content, study, limits)
+                yield from _label_maps(drawing, study, limits)
             except InputError as error:
                 yield LeftOut(drawing.name, str(error))
 
 
-def _label_map(drawing: Dataset, study: Sequence[StudyFile], limits: ImageLimits) -> LabelMap:
+def _label_maps(drawing: StudyFile, study: Sequence[StudyFile], limits: ImageLimits) -> list[LabelMap]:
+    grid = _grid_of_images(drawing.content, study)
+    meanings = coded_meanings(drawing.content)
+    drawn = [
+        (number, meanings.get(number, ""), _packed(stacks, grid))
+        for number, stacks in stacks_by_label(drawing.content, "drawing", limits, grid)
+    ]
+    together = len(drawn) <= MOST_VALUES and not _overlap([bits for *_, bits in drawn])
+    groups = [drawn] if together else [[one] for one in drawn]
+    return [_label_map(group, grid, drawing.name) for group in groups]
+
+
+def _label_map(drawn: Sequence[tuple[int, str, UInt8[np.ndarray, "n"]]], grid: Grid, name: str) -> LabelMap:
+    values = np.zeros(int(np.prod(grid.shape)), np.uint8)
+    for value, (*_, bits) in enumerate(drawn, 1):
+        values[np.unpackbits(bits, count=values.size).astype(bool)] = value
+    structures = tuple(Structure(value, number, meaning) for value, (number, meaning, _) in enumerate(drawn, 1))
+    return LabelMap(values.reshape(grid.shape), grid, structures, name)
+
+
+def _packed(stacks: Sequence[MaskStack], grid: Grid) -> UInt8[np.ndarray, "n"]:
+    """Voxels of the grid that the stacks draw, eight in a byte.
+
+    Raises:
+        InvalidMask: a stack on another grid.
+    """
+    if not all(stack.grid.coincides_with(grid) for stack in stacks):
+        raise InvalidMask("A drawing does not lie on its images; one that does is accepted.", part="drawing")
+    return np.packbits(np.logical_or.reduce([stack.foreground for stack in stacks]))
+
+
+def _overlap(masks: Sequence[UInt8[np.ndarray, "n"]]) -> bool:
+    """Whether two packed masks share a voxel."""
+    held = np.zeros_like(masks[0])
+    for mask in masks:
+        if (held & mask).any():
+            return True
+        held |= mask
+    return False
+
+
+def coded_meanings(drawing: Dataset) -> dict[int, str]:
+    """What the codes of segments and regions mean, by number: their kind, and modifiers such as the side.
+
+    Raises:
+        UnreadableImage: damaged.
+    """
+    with tolerant("drawing"):
+        if drawing.SOPClassUID == RTStructureSetStorage:
+            number, name = "ReferencedROINumber", "RTROIIdentificationCodeSequence"
+            items = drawing.get("RTROIObservationsSequence") or []
+        else:
+            number, name = "SegmentNumber", "SegmentedPropertyTypeCodeSequence"
+            items = drawing.SegmentSequence
+        named = [(int(item[number].value), _meaning(item, name)) for item in items]
+        return {number: meaning for number, meaning in reversed(named) if meaning}
+
+
+def _meaning(item: Dataset, name: str) -> str:
+    """Meaning of the first code and of its modifiers (PS3.3, C.8.20.2)."""
+    kinds = (item.get(name) or [])[:1]
+    codes = [*kinds, *(code for kind in kinds for code in kind.get("SegmentedPropertyTypeModifierCodeSequence") or [])]
+    return ", ".join(str(code.CodeMeaning) for code in codes if code.get("CodeMeaning"))
+
+
+def _grid_of_images(drawing: Dataset, study: Sequence[StudyFile]) -> Grid:
+    """The grid of the images that were drawn on."""
     series = referenced_series(drawing)
     found = [file.content for file in study if file.content.get("SeriesInstanceUID") == series]
-    grid = series_of([image for image in found if image.SOPClassUID not in DRAWINGS]).grid
-    values = np.zeros(grid.shape, np.uint8)
-    for stack in stacks_of_object(drawing, "drawing", limits, home=grid):
-        if not stack.grid.coincides_with(grid):
-            raise InvalidMask("A drawing does not lie on its images; one that does is accepted.", part="drawing")
-        values |= stack.foreground.astype(np.uint8)
-    return LabelMap(values, grid)
+    return series_of([image for image in found if image.SOPClassUID not in DRAWINGS]).grid

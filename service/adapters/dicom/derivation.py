@@ -12,11 +12,13 @@ import highdicom as hd
 import numpy as np
 from jaxtyping import Float
 from pydicom import Dataset
+from pydicom.sequence import Sequence as Items
 from pydicom.sr.codedict import codes
 from pydicom.sr.coding import Code
 from pydicom.uid import UID
 
 from model.bundle import Manifest
+from service.adapters.dicom.laterality import SIDES
 from service.adapters.dicom.masks import label_names
 from service.adapters.dicom.series import Series
 from service.ports import Outcome
@@ -48,6 +50,7 @@ class Derivation:
         key: the same for the same drawing, model and settings; decides all identifiers.
         version: of this program.
         labels: numbers of the drawing's segments or regions that it was made of; all of them when None.
+        side: letter of the side it is on (`service.adapters.dicom.laterality`), empty when it is not known.
     """
 
     drawing: Dataset
@@ -57,6 +60,7 @@ class Derivation:
     key: str
     version: str
     labels: frozenset[int] | None = None
+    side: str = ""
 
     def uid(self, name: str) -> UID:
         """Identifier of one object or series of the results."""
@@ -78,9 +82,10 @@ class Derivation:
 
     @property
     def label(self) -> str:
-        """What the structure is called: as it was drawn where the drawing has several, else as the model is."""
+        """What the structure is called: as drawn where the drawing has several, else as the model is, and its side."""
         _, name = self.structure or (0, "")
-        return name[:LONGEST_LABEL] or self.outcome.model_name
+        side = f", {SIDES[self.side].meaning.lower()}" if self.side else ""
+        return name[:LONGEST_LABEL] or f"{self.outcome.model_name[: LONGEST_LABEL - len(side)]}{side}"
 
     @property
     def is_cut(self) -> bool:
@@ -140,6 +145,15 @@ def anatomy_of(manifest: Manifest) -> Code:
     if not manifest.anatomy:
         return Code("91723000", "SCT", "Anatomical structure")
     return Code(manifest.anatomy["value"], manifest.anatomy["scheme"], manifest.anatomy["meaning"])
+
+
+def property_type(derivation: Derivation) -> hd.sr.CodedConcept:
+    """The structure's code, with its side as modifier where that is known (PS3.3, C.8.20.2)."""
+    anatomy = hd.sr.CodedConcept.from_code(derivation.anatomy)
+    if derivation.side:
+        side = hd.sr.CodedConcept.from_code(SIDES[derivation.side])
+        anatomy.SegmentedPropertyTypeModifierCodeSequence = Items([side])
+    return anatomy
 
 
 def frames_on(series: Series, volume: Float[np.ndarray, "i j k"]) -> Float[np.ndarray, "k j i"]:

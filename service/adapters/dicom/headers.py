@@ -53,8 +53,9 @@ def completed(images: Sequence[Dataset], grid: Grid, part: str) -> tuple[Dataset
     """Copies of images that lie on a grid, with every element that objects derived from them must carry over.
 
     Text is Unicode (`CHARACTER_SET`), however the headers were read. Dates and times of old forms are of today's
-    form, those that are none are empty. What is absent of patient and study is empty. The slice thickness is the
-    distance of the planes where the images give none. The frames' directions and spacing are said once for all.
+    form, those that are none are empty. What is absent of patient and study is empty. The distance of the planes is
+    that of their positions, whatever the images say of it; the slice thickness is the same where the images give none.
+    The frames' directions and spacing are said once for all.
     Pixels, and a file's meta information, are shared with the images.
 
     Raises:
@@ -70,7 +71,7 @@ def completed(images: Sequence[Dataset], grid: Grid, part: str) -> tuple[Dataset
             _complete(image, part)
             _require_spelling(image, source, part)
             _share_groups(image)
-            _give_thickness(image, grid)
+            _give_distances(image, grid)
             if "ImageOrientationPatient" in found[0]:
                 image.ImageOrientationPatient = found[0].ImageOrientationPatient
     for name in SHARED:
@@ -193,11 +194,13 @@ def _share_groups(image: Dataset) -> None:
             setattr(shared, name, frames[0][name].value)
 
 
-def _give_thickness(image: Dataset, grid: Grid) -> None:
-    """The distance of the planes as slice thickness where there is none (type 1C in what is derived)."""
+def _give_distances(image: Dataset, grid: Grid) -> None:
+    """The distance of the planes, and as slice thickness where there is none (type 1C in what is derived)."""
     shared = image.get("SharedFunctionalGroupsSequence")
     measures = shared[0].get("PixelMeasuresSequence") if shared else None
     holder = measures[0] if measures else image
+    distance = DSfloat(float(f"{grid.spacing[2]:.6g}"), auto_format=True)
+    holder.add_new(Tag(0x00180088), "DS", distance)
     thickness = holder.get("SliceThickness")
     if not isinstance(thickness, int | float) or not isfinite(thickness) or thickness <= 0:
-        holder.add_new(Tag(0x00180050), "DS", DSfloat(float(f"{grid.spacing[2]:.6g}"), auto_format=True))
+        holder.add_new(Tag(0x00180050), "DS", distance)

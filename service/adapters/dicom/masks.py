@@ -49,6 +49,30 @@ def stacks_of_object(
         InvalidMask, InvalidGeometry, InvalidParameter, TooLarge: as the readers say.
     """
     checked_labels(labels)
+    return _stacks(found, part, limits, labels, home)
+
+
+def stacks_by_label(
+    found: Dataset, part: str, limits: ImageLimits, home: Grid | None = None
+) -> Iterator[tuple[int, tuple[MaskStack, ...]]]:
+    """The stacks of each segment or region that draws something by itself, in the order of the object.
+
+    Errors are those of `stacks_of_object`, with all labels where nothing is drawn at all.
+    """
+    with tolerant(part):
+        is_drawing = found.get("SOPClassUID") in DRAWINGS
+    drawn = drawn_labels(found, part) if is_drawing else frozenset()
+    if not drawn:
+        _stacks(found, part, limits, None, home)
+    for number in label_names(found, part):
+        if number in drawn:
+            yield number, _stacks(found, part, limits, frozenset([number]), home)
+
+
+def _stacks(
+    found: Dataset, part: str, limits: ImageLimits, labels: frozenset[int] | None, home: Grid | None
+) -> tuple[MaskStack, ...]:
+    """As `stacks_of_object`, of any numbers that segments and regions can have."""
     with tolerant(part):
         kind = found.get("SOPClassUID")
     if kind not in DRAWINGS:
@@ -62,10 +86,10 @@ def stacks_of_object(
 
 
 def drawn_labels(found: Dataset, part: str) -> frozenset[int]:
-    """Numbers of the segments or regions that draw something; of label maps, all but the background.
+    """Numbers of the segments or regions that draw something: a voxel, or a closed contour around an area.
 
     Raises:
-        UnreadableImage: damaged.
+        UnreadableImage, InvalidMask: damaged, or pixels that are no segmentation's.
     """
     with tolerant(part):
         is_structures = found.SOPClassUID == RTStructureSetStorage

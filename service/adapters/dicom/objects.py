@@ -7,7 +7,7 @@ size is known.
 
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import BinaryIO
 
@@ -115,17 +115,23 @@ def checked_frames(found: Dataset, part: str, limits: ImageLimits) -> tuple[int,
     return frames, rows, columns
 
 
-def frames_of(found: Dataset, part: str) -> Iterator[Shaped[np.ndarray, "rows columns"]]:
-    """Stored values of each frame in turn; call `checked_frames` before."""
+def frames_of(
+    found: Dataset, part: str, numbers: Sequence[int] | None = None
+) -> Iterator[Shaped[np.ndarray, "rows columns"]]:
+    """Stored values of each frame in turn, or of those so numbered (from 0); call `checked_frames` before."""
     with tolerant(part):
+        chosen = range(int(found.get("NumberOfFrames") or 1)) if numbers is None else numbers
         packed = int(found.BitsAllocated) == 1 and not found.file_meta.TransferSyntaxUID.is_compressed
-        yield from _bits_of(found) if packed else iter_pixels(found, raw=True)
+        if packed:
+            yield from _bits_of(found, chosen)
+        elif chosen:
+            yield from iter_pixels(found, raw=True, indices=chosen)
 
 
-def _bits_of(found: Dataset) -> Iterator[Bool[np.ndarray, "rows columns"]]:
+def _bits_of(found: Dataset, numbers: Sequence[int]) -> Iterator[Bool[np.ndarray, "rows columns"]]:
     """Frames of one bit a pixel; they follow each other without a gap, so one may begin within a byte (PS3.5, 8.1)."""
     size, data = found.Rows * found.Columns, found.PixelData
-    for start in range(0, size * int(found.get("NumberOfFrames") or 1), size):
+    for start in (size * number for number in numbers):
         held = np.frombuffer(data, np.uint8, (start + size + 7) // 8 - start // 8, start // 8)
         bits = np.unpackbits(held, bitorder="little")[start % 8 : start % 8 + size]
         yield bits.reshape(found.Rows, found.Columns).astype(bool)

@@ -4,15 +4,15 @@ Pixels are counted along a row first: index axes are column, row and plane, as i
 `model.geometry`.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydicom import Dataset
 
 from model.errors import InvalidGeometry
-from model.geometry import Grid
+from model.geometry import Grid, slab
 from service.adapters.dicom.objects import tolerant
 from service.adapters.image_guard import LPS_TO_RAS
 
@@ -26,10 +26,12 @@ NOMINAL_SHARE = 0.01
 REGULAR_MM = 0.02
 #: A distance of this many usual ones lacks a plane.
 GAP = 1.5
-#: Steps tried for irregular planes: their smallest distance through 1, 2, ... so many.
-FINEST_PART = 16
-#: No step below this is tried (mm), unless planes are nearer to each other: they are rounded by half of it at most.
+#: No step below this is tried for irregular planes (mm), unless planes are nearer to each other.
 FINEST_MM = 0.1
+#: Steps tried for irregular planes, at most: their smallest distance through 1, 2, ... so many.
+MOST_PARTS = 10_000
+#: Counts that differ by less than this are equal.
+ROUNDING = 1e-6
 #: Planes named in a message, at most.
 LISTED_PLANES = 4
 
@@ -68,27 +70,56 @@ class FramePlane:
         return np.asarray(np.stack([self.row, self.column, self.normal]) @ (other.origin - self.origin))
 
 
+@dataclass(frozen=True)
+class DrawnStack:
+    """A voxel grid (RAS) through planes of a drawing.
+
+    Attributes:
+        numbers: of the planes, as they were given.
+        places: index of each along the grid's last axis.
+    """
+
+    grid: Grid
+    numbers: Int[np.ndarray, "n"]
+    places: Int[np.ndarray, "n"]
+
+
 def frame_planes(found: Dataset, part: str) -> list[FramePlane]:
     """The plane of each frame, of single-frame images and of multi-frame functional groups.
 
     Raises:
-        UnreadableImage: an object without planes.
-        InvalidGeometry: directions or spacings that no plane has.
+        UnreadableImage: damaged.
+        InvalidGeometry: a frame without a plane in the patient's coordinates, as of a volume with coordinates of its
+            own, or with directions or spacings that no plane has.
     """
     with tolerant(part):
         if "PerFrameFunctionalGroupsSequence" not in found:
             return [_plane(found, found, found, part)]
-        shared = found.get("SharedFunctionalGroupsSequence") or [Dataset()]
-        return [_plane_of_groups(groups, shared[0], part) for groups in found.PerFrameFunctionalGroupsSequence]
+        shared = (found.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
+        return [_plane(*_macros(groups, shared), part) for groups in found.PerFrameFunctionalGroupsSequence]
 
 
-def _plane_of_groups(frame: Dataset, shared: Dataset, part: str) -> FramePlane:
+def _macros(frame: Dataset, shared: Dataset) -> tuple[Dataset, Dataset, Dataset]:
+    """Position, orientation and pixel measures of a frame, of its own or shared; empty where there are none."""
     names = ("PlanePositionSequence", "PlaneOrientationSequence", "PixelMeasuresSequence")
-    position, orientation, measures = ((frame if name in frame else shared)[name][0] for name in names)
-    return _plane(position, orientation, measures, part)
+    position, orientation, measures = (
+        ((frame if name in frame else shared).get(name) or [Dataset()])[0] for name in names
+    )
+    return position, orientation, measures
 
 
 def _plane(position: Dataset, orientation: Dataset, measures: Dataset, part: str) -> FramePlane:
+    needed = (
+        (position, "ImagePositionPatient"),
+        (orientation, "ImageOrientationPatient"),
+        (measures, "PixelSpacing"),
+    )
+    if not all(holder.get(name) for holder, name in needed):
+        raise InvalidGeometry(
+            f"{part} has a frame without a plane in the patient's coordinates; frames with Image Position (Patient), "
+            "Image Orientation (Patient) and Pixel Spacing are accepted",
+            part=part,
+        )
     origin = np.array(position.ImagePositionPatient, float)
     row, column = np.array(orientation.ImageOrientationPatient, float).reshape(2, 3)
     between_rows, between_columns = map(float, measures.PixelSpacing)
@@ -130,27 +161,48 @@ def _alike(first: FramePlane, second: FramePlane) -> bool:
     return bool(turned <= PARALLEL) and np.allclose(first.spacing, second.spacing, rtol=1e-3)
 
 
-def stack_places(planes: Sequence[FramePlane]) -> tuple[Int[np.ndarray, "n"], float]:
+def stack_places(planes: Sequence[FramePlane], finest_mm: float = 0.0) -> tuple[Int[np.ndarray, "n"], float] | None:
     """Place of each plane of a sparse drawing in a regular stack from 0 on, and the stack's step (mm).
 
-    Tried are the planes' nominal distance and parts of their smallest one. Each is fitted to the planes, so that
-    rounded positions do not add up.
+    Tried are the planes' nominal distance and parts of their smallest one, from the coarsest on. Each is fitted to
+    the planes, so that rounded positions do not add up. The planes lie within `REGULAR_MM` of their places.
+
+    Args:
+        finest_mm: no step below this is tried, as it would take too many planes, but one that the planes state.
+
+    Returns:
+        None where no step fits the planes.
     """
-    heights = np.array([planes[0].offset(plane)[2] for plane in planes])
-    up, depth = heights - heights.min(), _depth(planes)
-    distances, near = np.diff(np.unique(up)), min(REGULAR_MM, depth / 2)
+    up, depth = _heights(planes), _depth(planes)
+    near = _near_mm(depth)
+    distances = np.diff(np.unique(up))
     smallest = float(distances.min(initial=np.inf, where=distances > near))
     if not np.isfinite(smallest):
         return np.zeros(len(planes), int), depth
-    parts = [smallest / count for count in range(1, FINEST_PART + 1)]
-    tried = [(depth, NOMINAL_SHARE), *((part, REGULAR_SHARE) for part in parts)]
-    tried = [(step, share) for step, share in tried if step >= min(smallest, FINEST_MM)]
-    for step, share in tried:
+    nominal = [(depth, NOMINAL_SHARE)] if depth >= finest_mm or any(_stated_depths(planes)) else []
+    for step, share in (*nominal, *((part, REGULAR_SHARE) for part in _parts(smallest, finest_mm))):
         places, fitted = _fitted(up, step)
         if abs(fitted - step) <= share * step and np.abs(up - places * fitted).max() <= near:
             return places, fitted
-    finest = tried[-1][0]
-    return np.rint(up / finest).astype(int), finest
+    return None
+
+
+def _heights(planes: Sequence[FramePlane]) -> Float[np.ndarray, "n"]:
+    """Heights of parallel planes above the lowest one (mm)."""
+    heights = np.array([planes[0].offset(plane)[2] for plane in planes])
+    return np.asarray(heights - heights.min())
+
+
+def _near_mm(depth: float) -> float:
+    """Distance (mm) of planes at one place, whose nominal distance is known."""
+    return min(REGULAR_MM, depth / 2)
+
+
+def _parts(smallest: float, finest_mm: float) -> Iterator[float]:
+    """The smallest distance of planes through 1, 2, ..., down to the finest step."""
+    finest = max(min(smallest, FINEST_MM), finest_mm)
+    count = min(int(smallest / finest + ROUNDING), MOST_PARTS)
+    yield from (smallest / number for number in range(1, count + 1))
 
 
 def _fitted(up: Float[np.ndarray, "n"], step: float) -> tuple[Int[np.ndarray, "n"], float]:
@@ -163,7 +215,12 @@ def _fitted(up: Float[np.ndarray, "n"], step: float) -> tuple[Int[np.ndarray, "n
 
 def _depth(planes: Sequence[FramePlane]) -> float:
     """Nominal distance between planes (mm); their finer pixel spacing when none says it."""
-    return next((p.depth for p in planes if np.isfinite(p.depth) and p.depth > 0), min(planes[0].spacing))
+    return next(_stated_depths(planes), min(planes[0].spacing))
+
+
+def _stated_depths(planes: Sequence[FramePlane]) -> Iterator[float]:
+    """Nominal distances (mm) that planes say."""
+    return (plane.depth for plane in planes if np.isfinite(plane.depth) and plane.depth > 0)
 
 
 def complete_places(planes: Sequence[FramePlane], part: str) -> tuple[Int[np.ndarray, "n"], float]:
@@ -230,10 +287,53 @@ def _listed(names: Iterable[object]) -> str:
     return ", ".join(every[:LISTED_PLANES]) + (f" and {rest} more" if rest > 0 else "")
 
 
-def stack_grid(planes: Sequence[FramePlane], columns: int, rows: int) -> tuple[Grid, Int[np.ndarray, "n"]]:
-    """Voxel grid (RAS) around parallel drawn planes in register, and each plane's index along its last axis."""
-    places, step = stack_places(planes)
-    return grid_at(planes, places, step, columns, rows), places
+def drawn_stacks(
+    planes: Sequence[FramePlane], columns: int, rows: int, most_voxels: float, room_mm: float = 0.0
+) -> list[DrawnStack]:
+    """Voxel grids (RAS) on which parallel drawn planes in register lie where they were drawn, to within `REGULAR_MM`.
+
+    It is one grid where a step fits all of the planes. Otherwise each plane is a stack by itself, and the first, which
+    is the lowest, reaches past all of them, so that maps on its grid hold the whole object.
+
+    Args:
+        most_voxels: a step that would take more of them is not tried for irregular planes.
+        room_mm: before the first plane and behind the last.
+    """
+    up, depth = _heights(planes), _depth(planes)
+    levels = _levels(up, _near_mm(depth))
+    length = float(up.max()) + 2 * room_mm
+    finest = length / max(most_voxels / (columns * rows) - len(levels) - 3, ROUNDING)
+    regular = stack_places(planes, finest)
+    if regular is not None:
+        grid = grid_at(planes, *regular, columns, rows)
+        return [_longer(DrawnStack(grid, np.arange(len(planes)), regular[0]), room_mm, room_mm)]
+    step = max(depth, finest)
+    lowest, *others = (_flat_stack(planes, numbers, step, columns, rows) for numbers in levels)
+    return [_longer(lowest, room_mm, length - room_mm), *others]
+
+
+def _levels(up: Float[np.ndarray, "n"], near: float) -> list[Int[np.ndarray, "_"]]:
+    """Numbers of the planes at each place, from the lowest to the highest."""
+    order = np.argsort(up, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(up[order]) > near) + 1)
+
+
+def _flat_stack(
+    planes: Sequence[FramePlane], numbers: Int[np.ndarray, "n"], step: float, columns: int, rows: int
+) -> DrawnStack:
+    """Planes at one place as a stack of one plane."""
+    chosen, places = [planes[number] for number in numbers], np.zeros(len(numbers), int)
+    return DrawnStack(grid_at(chosen, places, step, columns, rows), numbers, places)
+
+
+def _longer(stack: DrawnStack, before_mm: float, behind_mm: float) -> DrawnStack:
+    """The stack with more planes before its first and behind its last one, over lengths at least so long."""
+    step = stack.grid.spacing[2]
+    before, behind = (int(np.ceil(length / step - ROUNDING)) for length in (before_mm, behind_mm))
+    affine = stack.grid.affine.copy()
+    affine[:3, 3] -= before * affine[:3, 2]
+    columns, rows, count = stack.grid.shape
+    return replace(stack, grid=Grid((columns, rows, before + count + behind), affine), places=stack.places + before)
 
 
 def grid_at(planes: Sequence[FramePlane], places: Int[np.ndarray, "n"], step: float, columns: int, rows: int) -> Grid:
@@ -247,18 +347,37 @@ def grid_at(planes: Sequence[FramePlane], places: Int[np.ndarray, "n"], step: fl
     return Grid((columns, rows, int(places.max()) + 1), LPS_TO_RAS @ affine)
 
 
-def at_home(grid: Grid, places: Int[np.ndarray, "n"], home: Grid | None) -> tuple[Grid, Int[np.ndarray, "n"]]:
-    """The images' grid and the planes' indices in it, where they are planes of the images; else both as they are.
+def stack_at_home(
+    planes: Sequence[FramePlane], columns: int, rows: int, home: Grid | None, most_voxels: float
+) -> DrawnStack | None:
+    """Drawn planes in register as planes of the images; None where they are not all theirs.
 
     The images may lie off their places, and the planes off theirs, each by `REGULAR_SHARE`.
+
+    Args:
+        most_voxels: see `on_images`.
     """
-    if home is None or home.shape[:2] != grid.shape[:2]:
-        return grid, places
-    planes = grid.to_world(np.array([[0.0, 0.0, place] for place in places]))
-    index = home.to_index(planes)
-    turned = np.abs(home.affine[:3, :2] - grid.affine[:3, :2]).max() / home.spacing[:2].min()
+    if home is None or home.shape[:2] != (columns, rows):
+        return None
+    across = grid_at(planes[:1], np.zeros(1, int), 1.0, columns, rows).affine[:3, :2]
+    index = home.to_index(np.array([plane.origin for plane in planes]) @ LPS_TO_RAS[:3, :3])
+    turned = np.abs(home.affine[:3, :2] - across).max() / home.spacing[:2].min()
     apart = np.abs(index - np.rint(index)).max()
     within = index[:, 2].min() > -0.5 and index[:, 2].max() < home.shape[2] - 0.5
     if max(turned, apart, np.abs(index[:, :2]).max()) > 2 * REGULAR_SHARE or not within:
-        return grid, places
-    return home, np.rint(index[:, 2]).astype(int)
+        return None
+    return on_images(home, np.rint(index[:, 2]).astype(int), most_voxels)
+
+
+def on_images(home: Grid, places: Int[np.ndarray, "n"], most_voxels: float) -> DrawnStack:
+    """Planes drawn on images, on the grid of all of these; from the first to the last drawn one where that is too large.
+
+    Args:
+        places: indices along the last axis of the images' grid.
+        most_voxels: of a grid of all images.
+    """
+    numbers = np.arange(len(places))
+    if np.prod([float(n) for n in home.shape]) <= most_voxels:
+        return DrawnStack(home, numbers, places)
+    first, last = int(places.min()), int(places.max())
+    return DrawnStack(slab(home, first, last), numbers, places - first)

@@ -21,7 +21,8 @@ EDITION = "dicomfields_2026c"
 #: Acts on an element of a data set, by its group and number.
 Action = Callable[[Dataset, tuple[int, int]], None]
 
-#: Elements that the table lacks: identifiers, and texts that people type, which an object may be without.
+#: Elements that the table lacks: identifiers, addresses that hold some, and texts that people type, which an object
+#: may be without.
 REMOVED = (
     *("SegmentDescription", "FrameOfInterestDescription", "SurfaceComments", "ReferenceLocationDescription"),
     *("GraphicLayerDescription", "GraphicGroupDescription", "FiducialDescription"),
@@ -31,6 +32,7 @@ REMOVED = (
     *("LocalNamespaceEntityID", "UniversalEntityID", "DeviceID", "GridID", "ImageID"),
     *("PatientBirthDateInAlternativeCalendar", "PatientDeathDateInAlternativeCalendar"),
     *("SecondaryReviewerName", "EvaluatorName", "DocumentAuthorTrial"),
+    *("RetrieveURL", "RetrieveURI", "StorageURL", "StoredInstanceBaseURI", "FolderAccessURI", "FileAccessURI"),
 )
 #: Texts that it lacks and an object has to have, if without a value (type 2).
 EMPTIED = ("ContentDescription", "DocumentTitle")

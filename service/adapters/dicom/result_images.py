@@ -8,7 +8,8 @@ from pydicom.sequence import Sequence
 from pydicom.sr.codedict import codes
 from pydicom.sr.coding import Code
 
-from service.adapters.dicom.derivation import MANUFACTURER, Derivation, algorithm, frames_on
+from service.adapters.dicom.derivation import MANUFACTURER, Derivation, algorithm, frames_on, property_type
+from service.adapters.dicom.laterality import UNPAIRED
 
 #: Unit and upper bound of the entropy of a voxel that is inside or outside.
 NAT = Code("{nat}", "UCUM", "nat")
@@ -24,7 +25,7 @@ def segmentation(derivation: Derivation, inside: Bool[np.ndarray, "i j k"]) -> h
         segment_number=1,
         segment_label=derivation.label,
         segmented_property_category=codes.SCT.AnatomicalStructure,
-        segmented_property_type=derivation.anatomy,
+        segmented_property_type=property_type(derivation),
         algorithm_type=hd.seg.SegmentAlgorithmTypeValues.SEMIAUTOMATIC,
         algorithm_identification=algorithm(derivation),
         tracking_uid=derivation.uid("tracking"),
@@ -95,8 +96,8 @@ def _map(
 
 
 def _frame_anatomy(derivation: Derivation) -> Dataset:
-    """Anatomy of all frames (C.7.6.16.2.8); the side of a paired organ is not known from its drawing."""
+    """Anatomy of all frames (C.7.6.16.2.8), which readers want and has to name a side: unpaired where none is known."""
     anatomy = Dataset()
     anatomy.AnatomicRegionSequence = Sequence([hd.sr.CodedConcept.from_code(derivation.anatomy)])
-    anatomy.FrameLaterality = "U"
+    anatomy.FrameLaterality = derivation.side or UNPAIRED
     return anatomy

@@ -6,6 +6,7 @@ from pydicom.sr.coding import Code
 
 from model.inference.estimates import Estimate
 from service.adapters.dicom.derivation import DISCLAIMER, MANUFACTURER, Derivation
+from service.adapters.dicom.laterality import SIDES
 
 #: Scheme of the concepts that no standard vocabulary has.
 PRIVATE_SCHEME = "99MORPHOFLOW"
@@ -63,7 +64,7 @@ def _group(
         tracking_identifier=hd.sr.TrackingIdentifier(derivation.uid("tracking"), derivation.label),
         referenced_segment=_segment(derivation, segmentation),
         finding_type=derivation.anatomy,
-        finding_sites=[hd.sr.FindingSite(derivation.anatomy)],
+        finding_sites=[hd.sr.FindingSite(derivation.anatomy, SIDES.get(derivation.side))],
         algorithm_id=_algorithm(derivation),
         measurements=[
             _measurement(codes.SCT.Volume, answer.volume_ml, MILLILITRE),

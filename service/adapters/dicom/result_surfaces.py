@@ -8,7 +8,7 @@ from pydicom.sr.coding import Code
 from pydicom.uid import EncapsulatedSTLStorage, SurfaceSegmentationStorage
 
 from model.inference.mesh import Mesh, transformed
-from service.adapters.dicom.derivation import MANUFACTURER, Derivation, algorithm, references
+from service.adapters.dicom.derivation import MANUFACTURER, Derivation, algorithm, property_type, references
 from service.adapters.image_guard import LPS_TO_RAS
 from service.adapters.mesh_formats import write_mesh
 
@@ -111,7 +111,7 @@ def _segment(derivation: Derivation) -> Dataset:
     segment, surface = Dataset(), Dataset()
     segment.SegmentNumber, segment.SegmentLabel = 1, derivation.label
     segment.SegmentedPropertyCategoryCodeSequence = _coded(codes.SCT.AnatomicalStructure)
-    segment.SegmentedPropertyTypeCodeSequence = _coded(derivation.anatomy)
+    segment.SegmentedPropertyTypeCodeSequence = Sequence([property_type(derivation)])
     segment.SegmentAlgorithmType, segment.SurfaceCount = "SEMIAUTOMATIC", 1
     surface.ReferencedSurfaceNumber = 1
     surface.SegmentSurfaceGenerationAlgorithmIdentificationSequence = algorithm(derivation)

@@ -5,6 +5,7 @@ several stacks. A label is a segment number. Planes without a frame were not loo
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Shaped
@@ -15,15 +16,24 @@ from model.errors import InvalidMask, TooLarge
 from model.geometry import Grid
 from model.inference.mask_stack import MaskStack
 from model.inference.plane_cover import cover_planes
-from model.inference.stacks import EXCLUDED_VALUE, checked_labels, make_stack
+from model.inference.stacks import EXCLUDED_VALUE, make_stack
 from service.adapters.dicom.objects import checked_frames, frames_of, tolerant
-from service.adapters.dicom.planes import at_home, frame_planes, parallel_groups, stack_grid
+from service.adapters.dicom.planes import (
+    DrawnStack,
+    FramePlane,
+    drawn_stacks,
+    frame_planes,
+    parallel_groups,
+    stack_at_home,
+)
 from service.adapters.image_guard import ImageLimits
 
 #: SOP classes that are read here.
 SEGMENTATIONS = (SegmentationStorage, UID("1.2.840.10008.5.1.4.1.1.66.7"))
 #: Share of the largest value from which a voxel of a fractional segmentation belongs to the object.
 OCCUPIED = 0.5
+#: Voxels that are looked through for segments without any, at most.
+MOST_SEARCHED = 1 << 27
 #: Numbers listed in a message, at most.
 LISTED_NUMBERS = 12
 
@@ -46,33 +56,69 @@ def read_segmentation(
         InvalidMask: nothing drawn, no such segment, or pixels of a segment that the object does not describe.
         TooLarge: over a limit.
     """
-    checked_labels(labels)
     count, rows, columns = checked_frames(found, part, limits)
     planes = frame_planes(found, part)
     if len(planes) != count:
         raise InvalidMask(f"{part} places {len(planes)} of its {count} frames; a place for each is needed", part=part)
-    groups = parallel_groups(planes)
-    own = [stack_grid([planes[number] for number in group], columns, rows) for group in groups]
-    grids = [at_home(*grid, home) for grid in own]
-    require_room([grid for grid, _ in grids], part, limits)
+    stacks = _stacks_of_frames(planes, columns, rows, home, limits)
+    grids = [stack.grid for stack in stacks]
+    require_room(grids, part, limits)
     seat = {
-        frame: (g, place)
-        for g, group in enumerate(groups)
-        for frame, place in zip(group, grids[g][1].tolist(), strict=True)
+        frame: (number, place)
+        for number, stack in enumerate(stacks)
+        for frame, place in zip(stack.numbers.tolist(), stack.places.tolist(), strict=True)
     }
-    volumes = [np.zeros(grid.shape, bool) for grid, _ in grids]
-    for frame, drawn in enumerate(_drawings(found, part, labels)):
-        group, place = seat[frame]
-        volumes[group][:, :, place] |= drawn.T
-    framed = [np.unique(places) for _, places in grids]
-    return stacks_of(part, [grid for grid, _ in grids], volumes, framed)
+    volumes = [np.zeros(grid.shape, bool) for grid in grids]
+    for frame, drawn in _drawings(found, part, labels):
+        number, place = seat[frame]
+        volumes[number][:, :, place] |= drawn.T
+    return stacks_of(part, grids, volumes, [np.unique(stack.places) for stack in stacks])
+
+
+def _stacks_of_frames(
+    planes: Sequence[FramePlane], columns: int, rows: int, home: Grid | None, limits: ImageLimits
+) -> list[DrawnStack]:
+    """Stacks that hold each frame once; those of frames on the images are the images'."""
+    groups = parallel_groups(planes)
+    stacks = []
+    for group in groups:
+        chosen = [planes[number] for number in group]
+        whole = stack_at_home(chosen, columns, rows, home, limits.max_voxels / len(groups))
+        own = [whole] if whole else drawn_stacks(chosen, columns, rows, limits.max_voxels / len(groups))
+        stacks += [replace(stack, numbers=np.array(group)[stack.numbers]) for stack in own]
+    return stacks
 
 
 def drawn_segments(found: Dataset, part: str) -> frozenset[int]:
-    """Numbers of the segments that have frames; of a label map, all but the background."""
+    """Numbers of the segments that have a voxel; of a label map, all but the background.
+
+    Frames are looked through until every segment was seen. In an object of more than `MOST_SEARCHED` voxels each
+    segment that has a frame counts.
+    """
     with tolerant(part):
-        is_map = found.SegmentationType == "LABELMAP"
-        return _numbers(found) & (_numbers(found) if is_map else frozenset(_segments_of_frames(found)))
+        known = _numbers(found)
+        framed = known if found.SegmentationType == "LABELMAP" else known & frozenset(_segments_of_frames(found))
+    try:
+        checked_frames(found, part, ImageLimits(max_bytes=MOST_SEARCHED, max_voxels=MOST_SEARCHED))
+    except TooLarge:
+        return framed
+    drawn: frozenset[int] = frozenset()
+    for numbers in _segments_in_frames(found, part):
+        drawn |= numbers & framed
+        if drawn == framed:
+            break
+    return drawn
+
+
+def _segments_in_frames(found: Dataset, part: str) -> Iterator[frozenset[int]]:
+    """Numbers of the segments that each frame has voxels of; of a label map, its values."""
+    with tolerant(part):
+        is_map, least = found.SegmentationType == "LABELMAP", _least_value(found)
+        segments = [] if is_map else _segments_of_frames(found)
+    if is_map:
+        yield from map(_values_of, frames_of(found, part))
+    for segment, frame in zip(segments, frames_of(found, part, range(len(segments))), strict=False):
+        yield frozenset([segment] if (frame >= least).any() else [])
 
 
 def listed(numbers: Iterable[int]) -> str:
@@ -115,12 +161,14 @@ def _values(volume: Bool[np.ndarray, "i j k"], drawn: Shaped[np.ndarray, "n"]) -
     return values
 
 
-def _drawings(found: Dataset, part: str, labels: frozenset[int] | None) -> Iterator[Bool[np.ndarray, "rows columns"]]:
-    """Which pixels of each frame are of the object."""
+def _drawings(
+    found: Dataset, part: str, labels: frozenset[int] | None
+) -> Iterator[tuple[int, Bool[np.ndarray, "rows columns"]]]:
+    """Numbers of the frames that may show the object, and which of their pixels are of it."""
     with tolerant(part):
-        kind, most = str(found.SegmentationType), float(found.get("MaximumFractionalValue") or 1)
+        is_map, least = found.SegmentationType == "LABELMAP", _least_value(found)
         known, ground = _numbers(found), _background(found)
-        segments = [] if kind == "LABELMAP" else _segments_of_frames(found)
+        segments = [] if is_map else _segments_of_frames(found)
     if labels is not None and not labels <= known:
         raise InvalidMask(
             f"{part} has no segment {listed(labels - known)}; segments that are there: {listed(known) or 'none'}",
@@ -128,14 +176,27 @@ def _drawings(found: Dataset, part: str, labels: frozenset[int] | None) -> Itera
         )
     _require_described(frozenset(segments), known, part)
     wanted = known & (labels or known)
+    if not is_map:
+        chosen = [number for number, segment in enumerate(segments) if segment in wanted]
+        for number, frame in zip(chosen, frames_of(found, part, chosen), strict=True):
+            yield number, frame >= least
+        return
     for number, frame in enumerate(frames_of(found, part)):
-        if kind == "LABELMAP":
-            _require_described(frozenset(np.unique(frame).tolist()) - {ground}, known, part)
-            yield np.isin(frame, sorted(wanted))
-        elif kind == "FRACTIONAL":
-            yield (frame >= OCCUPIED * most) & (segments[number] in wanted)
-        else:
-            yield (frame != 0) & (segments[number] in wanted)
+        _require_described(_values_of(frame) - {ground}, known, part)
+        yield number, np.isin(frame, sorted(wanted))
+
+
+def _least_value(found: Dataset) -> float:
+    """Stored value from which a voxel of a segment's frame belongs to it. Call within `tolerant`."""
+    most = float(found.get("MaximumFractionalValue") or 1)
+    return OCCUPIED * most if found.SegmentationType == "FRACTIONAL" else OCCUPIED
+
+
+def _values_of(frame: Shaped[np.ndarray, "rows columns"]) -> frozenset[int]:
+    """Distinct values of a frame; those of few bits are counted, which is faster than to sort them."""
+    if frame.dtype.kind == "u" and frame.dtype.itemsize <= 2:
+        return frozenset(np.flatnonzero(np.bincount(frame.ravel())).tolist())
+    return frozenset(np.unique(frame).tolist())
 
 
 def _require_described(drawn: frozenset[int], known: frozenset[int], part: str) -> None:

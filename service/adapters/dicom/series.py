@@ -3,12 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from pydicom import Dataset
 
 from model.errors import InvalidGeometry
+from model.geometry import slab
+from model.inference.mesh import Mesh
+from model.inference.reconstruction import SURFACE_SD
 from service.adapters.dicom.headers import completed
 from service.adapters.dicom.objects import tolerant
 from service.adapters.dicom.planes import FramePlane, ImageGrid, complete_places, frame_planes, grid_at
+
+#: Images farther from the surface than this hold nothing of the object: in mm, and in SDs of the surface on top.
+MARGIN_MM, MARGIN_SDS = 2.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -26,6 +33,28 @@ class Series:
     planes: tuple[FramePlane, ...]
     grid: ImageGrid
     order: tuple[int, ...]
+
+
+def around(series: Series, mesh: Mesh) -> Series:
+    """The images that a surface comes near, which results are given back on; one of many frames stays whole.
+
+    Args:
+        mesh: the surface (world RAS mm), with its SD where that is known.
+    """
+    if len(series.images) < len(series.planes):
+        return series
+    sd_mm = float(np.max(mesh.scalars.get(SURFACE_SD, 0.0)))
+    places = series.grid.to_index(mesh.vertices)[:, 2]
+    reach = (MARGIN_MM + MARGIN_SDS * sd_mm) / series.grid.spacing[2]
+    ends = np.array([places.min() - reach, places.max() + reach])
+    first, last = np.clip(np.rint(ends), 0, series.grid.shape[2] - 1).astype(int).tolist()
+    kept = [number for number, place in enumerate(series.order) if first <= place <= last]
+    return Series(
+        tuple(series.images[number] for number in kept),
+        tuple(series.planes[number] for number in kept),
+        slab(series.grid, first, last),
+        tuple(series.order[number] - first for number in kept),
+    )
 
 
 def series_of(images: Sequence[Dataset], part: str = "series") -> Series:

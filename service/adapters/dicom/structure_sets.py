@@ -8,8 +8,8 @@ nothing. Contours of one region and plane are put together as their type says:
   such contours mean it, and one inside that adds again.
 
 A contour that comes twice counts once. One that encloses no pixel's centre stands for the pixel at its middle. Several
-regions are joined. A label is an ROI number. Points, open contours and those of fewer than three points enclose
-nothing and are passed over, as are regions without a closed contour.
+regions are joined. A label is an ROI number. Points, open contours, those of fewer than three points and those without
+an area (points on a line, halves that cancel each other) are passed over, as are regions without another contour.
 """
 
 from collections import defaultdict
@@ -24,9 +24,8 @@ from skimage.draw import polygon2mask
 from model.errors import InvalidGeometry, InvalidMask
 from model.geometry import Grid
 from model.inference.mask_stack import MaskStack
-from model.inference.stacks import checked_labels
 from service.adapters.dicom.objects import tolerant
-from service.adapters.dicom.planes import PARALLEL, REGULAR_SHARE, FramePlane, stack_grid
+from service.adapters.dicom.planes import PARALLEL, REGULAR_SHARE, DrawnStack, FramePlane, drawn_stacks, on_images
 from service.adapters.dicom.segmentations import listed, require_room, stacks_of
 from service.adapters.image_guard import LPS_TO_RAS, ImageLimits
 
@@ -34,6 +33,8 @@ from service.adapters.image_guard import LPS_TO_RAS, ImageLimits
 CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
 #: Numbers of a contour's data below which it encloses nothing.
 SMALLEST_CONTOUR = 9
+#: A contour has no area where twice its area through its extent is less than this (mm).
+NARROWEST_MM = 1e-3
 #: Distance of a contour's points from their common plane that is tolerated (mm).
 FLATNESS_MM = 0.1
 #: Digits (of mm) in which contours agree that are the same.
@@ -85,42 +86,50 @@ def read_structure_set(
 
     Raises:
         UnreadableImage, InvalidGeometry: damaged, or contours that are not planar or lie beside the images.
-        InvalidMask: no closed contour, or a region that the object does not have.
+        InvalidMask: no closed contour with an area, or a region that the object does not have.
         TooLarge: over a limit.
     """
-    checked_labels(labels)
-    contours = closed_contours(found, part, labels)
+    groups = _by_direction(closed_contours(found, part, labels))
     grids: list[Grid] = []
     volumes, drawn = [], []
-    for group in _by_direction(contours):
-        normal, sheets = group[0].normal, _sheets(group)
-        grid, places = _grid_of(sheets, normal, home)
-        require_room([*grids, grid], part, limits)
-        volume = np.zeros(grid.shape, bool)
-        for place, sheet in zip(places, sheets, strict=True):
-            volume[:, :, place] |= _filled(sheet, grid, part)
-        grids.append(grid)
-        volumes.append(volume)
-        drawn.append(np.unique(places))
+    for group in groups:
+        sheets = _sheets(group)
+        stacks = _stacks_of_sheets(sheets, group[0].normal, home, limits.max_voxels / len(groups))
+        grids += [stack.grid for stack in stacks]
+        require_room(grids, part, limits)
+        volumes += [_painted(stack, sheets, part) for stack in stacks]
+        drawn += [np.unique(stack.places) for stack in stacks]
     return stacks_of(part, grids, volumes, drawn)
+
+
+def _painted(stack: DrawnStack, sheets: Sequence[list[Contour]], part: str) -> Bool[np.ndarray, "i j k"]:
+    """What the contours of the planes on a stack enclose."""
+    volume = np.zeros(stack.grid.shape, bool)
+    for number, place in zip(stack.numbers.tolist(), stack.places.tolist(), strict=True):
+        volume[:, :, place] |= _filled(sheets[number], stack.grid, part)
+    return volume
 
 
 def closed_contours(found: Dataset, part: str, labels: frozenset[int] | None) -> list[Contour]:
     """The closed planar contours of the chosen regions, the largest first."""
     with tolerant(part):
         points = [
-            (number, np.array(item.ContourData, float).reshape(-1, 3), item.ContourGeometricType == CLOSED[1])
+            (number, _points(item), item.ContourGeometricType == CLOSED[1])
             for number, items in _drawn_regions(found, part, labels).items()
             for item in items
         ]
+        regions = labels or {int(region.ROINumber) for region in found.get("StructureSetROISequence") or []}
     if not points:
-        raise InvalidMask(f"{part} holds no closed planar contour of the region; one or more are needed", part=part)
+        where = f" of region {listed(regions)}" if regions else ""
+        raise InvalidMask(
+            f"{part} holds no closed planar contour around an area{where}; one or more are needed", part=part
+        )
     contours = [_flat(*contour, part) for contour in points]
     return sorted(contours, key=lambda contour: contour.area, reverse=True)
 
 
 def drawn_regions(found: Dataset, part: str) -> frozenset[int]:
-    """Numbers of the regions that have a closed contour."""
+    """Numbers of the regions that have a closed contour around an area."""
     with tolerant(part):
         return frozenset(_drawn_regions(found, part, None))
 
@@ -159,19 +168,14 @@ def images_of_regions(found: Dataset, part: str, labels: frozenset[int] | None =
 
 
 def _drawn_regions(found: Dataset, part: str, labels: frozenset[int] | None) -> dict[int, list[Dataset]]:
-    """The closed planar contours of each chosen region that has any; call within `tolerant`."""
+    """The closed planar contours around an area of each chosen region that has any; call within `tolerant`."""
     drawn: dict[int, list[Dataset]] = defaultdict(list)
     known = {int(region.ROINumber) for region in found.get("StructureSetROISequence") or []}
     for region in found.get("ROIContourSequence") or []:
         number = int(region.ReferencedROINumber)
         known.add(number)
         if labels is None or number in labels:
-            items = region.get("ContourSequence") or []
-            drawn[number] += [
-                item
-                for item in items
-                if item.ContourGeometricType in CLOSED and len(item.ContourData) >= SMALLEST_CONTOUR
-            ]
+            drawn[number] += [item for item in region.get("ContourSequence") or [] if _has_area(item)]
     if labels is not None and not labels <= known:
         raise InvalidMask(
             f"{part} has no region {listed(labels - known)}; regions that are there: {listed(known) or 'none'}",
@@ -180,14 +184,29 @@ def _drawn_regions(found: Dataset, part: str, labels: frozenset[int] | None) -> 
     return {number: items for number, items in drawn.items() if items}
 
 
+def _has_area(item: Dataset) -> bool:
+    """Whether an item is a closed contour around an area; call within `tolerant`."""
+    if item.ContourGeometricType not in CLOSED or len(item.ContourData) < SMALLEST_CONTOUR:
+        return False
+    points = _points(item)
+    extent_mm = max(np.ptp(points, axis=0).max(), NARROWEST_MM)
+    return not np.linalg.norm(_twice_area(points)) < NARROWEST_MM * extent_mm
+
+
+def _points(item: Dataset) -> Float[np.ndarray, "n 3"]:
+    return np.array(item.ContourData, float).reshape(-1, 3)
+
+
+def _twice_area(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    """The normal of a contour (Newell), as long as its area twice (mm2)."""
+    spokes = points - points.mean(axis=0)
+    return np.asarray(np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0))
+
+
 def _flat(region: int, points: Float[np.ndarray, "n 3"], is_xor: bool, part: str) -> Contour:
-    """A contour with its normal (Newell), turned so that its largest component is positive."""
-    following = np.roll(points, -1, axis=0)
-    middle = points.mean(axis=0)
-    area = np.cross(points - middle, following - middle).sum(axis=0)
+    """A contour with its normal, turned so that its largest component is positive."""
+    middle, area = points.mean(axis=0), _twice_area(points)
     length = np.linalg.norm(area)
-    if length == 0:
-        raise InvalidGeometry(f"{part} has a closed contour around no area; one around an area is accepted", part=part)
     normal = area / length
     if not np.isfinite(points).all() or not np.abs((points - middle) @ normal).max() <= FLATNESS_MM:
         raise InvalidGeometry(f"{part} has a contour that does not lie in a plane; planar ones are accepted", part=part)
@@ -228,23 +247,26 @@ def _parallel(first: Contour, second: Contour) -> bool:
     return bool(np.linalg.norm(np.cross(first.normal, second.normal)) <= 10 * PARALLEL)
 
 
-def _grid_of(
-    sheets: Sequence[list[Contour]], normal: Float[np.ndarray, "3"], home: Grid | None
-) -> tuple[Grid, list[int]]:
-    """A grid through the planes of a direction: the images' where the planes are theirs."""
+def _stacks_of_sheets(
+    sheets: Sequence[list[Contour]], normal: Float[np.ndarray, "3"], home: Grid | None, most_voxels: float
+) -> list[DrawnStack]:
+    """Stacks that hold each plane of a direction: the images' grid where the planes are theirs."""
     if home is not None and np.linalg.norm(np.cross(home.directions[:, 2], _ras(normal))) < 10 * PARALLEL:
         index = home.to_index(np.array([_ras(sheet[0].middle) for sheet in sheets]))[:, 2]
         near = np.abs(index - np.rint(index)).max() <= max(FLATNESS_MM / home.spacing[2], REGULAR_SHARE)
         if near and index.min() > -0.5 and index.max() < home.shape[2] - 0.5:
-            return home, [round(i) for i in index.tolist()]
-    return _own_grid(sheets, normal)
+            return [on_images(home, np.rint(index).astype(int), most_voxels)]
+    return _own_stacks(sheets, normal, most_voxels)
 
 
 def _ras(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return np.asarray(vectors @ LPS_TO_RAS[:3, :3])
 
 
-def _own_grid(sheets: Sequence[list[Contour]], across: Float[np.ndarray, "3"]) -> tuple[Grid, list[int]]:
+def _own_stacks(
+    sheets: Sequence[list[Contour]], across: Float[np.ndarray, "3"], most_voxels: float
+) -> list[DrawnStack]:
+    """Stacks on pixels that suit the drawing, with room around it."""
     points = np.concatenate([contour.points for sheet in sheets for contour in sheet])
     row, column = _axes(across)
     along = points @ np.stack([row, column]).T
@@ -257,17 +279,7 @@ def _own_grid(sheets: Sequence[list[Contour]], across: Float[np.ndarray, "3"]) -
         FramePlane(corner + normal * (sheet[0].points @ normal).mean(), row, column, (pixel, pixel), np.nan)
         for sheet in sheets
     ]
-    grid, places = stack_grid(planes, columns, rows)
-    return _with_room(grid, [int(place) for place in places])
-
-
-def _with_room(grid: Grid, places: list[int]) -> tuple[Grid, list[int]]:
-    """The grid with room before its first and behind its last plane."""
-    more = int(np.ceil(MARGIN_MM / grid.spacing[2]))
-    affine = grid.affine.copy()
-    affine[:3, 3] -= more * affine[:3, 2]
-    columns, rows, count = grid.shape
-    return Grid((columns, rows, count + 2 * more), affine), [place + more for place in places]
+    return drawn_stacks(planes, columns, rows, most_voxels, MARGIN_MM)
 
 
 def _axes(normal: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydicom.uid import DeflatedExplicitVRLittleEndian, RLELossless
+from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, RLELossless
 
 from model.errors import InputError, InvalidGeometry, InvalidMask, TooLarge, UnreadableImage
 from model.inference.mask_stack import common_space
 from model.inference.observations import Plane, find_planes
-from service.adapters.dicom.masks import read_dicom_mask, stacks_of_object
+from service.adapters.dicom.masks import drawn_labels, read_dicom_mask, stacks_of_object
 from service.adapters.dicom.series import series_of
 from service.adapters.images import ImageLimits, read_masks
 from tests.analytic_shapes import Ellipsoid
@@ -84,6 +84,22 @@ def test_planes_without_a_frame_were_not_looked_at(images):
     assert (stack.excluded.all(axis=(0, 1)) == ~values.any(axis=(0, 1))).all()
 
 
+@pytest.mark.parametrize("kind", ["segmentation", "structures"])
+def test_of_a_series_too_long_for_the_limit_only_the_drawn_part_is_read(kind):
+    images = mr_series(size=(36, 30, 60))
+    values, home = np.zeros((36, 30, 60), np.uint8), grid_of(images)
+    values[12:20, 9:18, 30:42:4] = 1
+    drawn = [("CLOSED_PLANAR", ring(images, number, (6.0,))[0]) for number in range(30, 42, 4)]
+    found = reread(seg_of(images, values) if kind == "segmentation" else rtstruct_of(images, drawn))
+    (whole,) = stacks_of_object(found, "object", LIMITS, home=home)
+    (part,) = stacks_of_object(found, "object", replace(LIMITS, max_voxels=36 * 30 * 20), home=home)
+    assert whole.grid.shape == home.shape
+    assert part.grid.shape == (36, 30, 9)
+    assert world_of(part) == pytest.approx(world_of(whole), abs=1e-6)
+    with pytest.raises(TooLarge):
+        stacks_of_object(found, "object", replace(LIMITS, max_voxels=36 * 30 * 8), home=home)
+
+
 def test_half_of_a_fraction_is_inside(images):
     values, _ = drawing(images)
     soft = values * 0.4
@@ -119,6 +135,40 @@ def test_a_segment_that_is_drawn_and_not_described_is_told(kind, labels):
     found.SegmentSequence = [item for item in found.SegmentSequence if item.SegmentNumber != 2]
     with pytest.raises(InvalidMask, match=r"draws segment 2, which it does not describe; segments that are there: 1$"):
         stacks_of_object(found, "mask[0]", LIMITS, labels)
+
+
+def with_empty_segment(images, kind):
+    """A drawing of two segments of which the second has frames and no voxel, and what the first draws."""
+    values, grid = drawing(images)
+    both = np.stack([values, np.zeros_like(values)], axis=-1)
+    if kind == "FRACTIONAL":
+        both = both * 0.9
+        both[values, 1] = 0.3
+    else:
+        both = both.astype(np.uint8)
+    return reread(seg_of(images, both, kind, labels=("left", "right"), omit_empty_frames=False)), values, grid
+
+
+@pytest.mark.parametrize("kind", ["BINARY", "FRACTIONAL", "LABELMAP"])
+def test_segments_without_a_voxel_draw_nothing(kind):
+    found, values, grid = with_empty_segment(mr_series(), kind)
+    assert drawn_labels(found, "mask[0]") == {1}
+    (stack,) = stacks_of_object(found, "mask[0]", LIMITS, home=grid)
+    assert (stack.foreground == values).all()
+    with pytest.raises(InvalidMask, match="draws nothing"):
+        stacks_of_object(found, "mask[0]", LIMITS, frozenset({2}))
+
+
+@pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, RLELossless])
+@pytest.mark.parametrize("kind", ["FRACTIONAL", "LABELMAP"])
+def test_drawn_segments_are_found_in_packed_pixels_too(kind, syntax):
+    images = mr_series()
+    values, _ = drawing(images)
+    side = np.indices(values.shape)[0] // 18
+    every = np.stack([values & (side == 1), values & (side == 2), values & (side == 0)], axis=-1)
+    every = every.astype(float if kind == "FRACTIONAL" else np.uint8)
+    found = seg_of(images, every, kind, labels=("right", "none", "left"), transfer_syntax_uid=syntax)
+    assert drawn_labels(reread(found), "mask[0]") == {1, 3}
 
 
 def test_planes_in_several_directions_become_several_stacks():

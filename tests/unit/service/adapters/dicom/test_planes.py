@@ -3,11 +3,15 @@
 import highdicom as hd
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydicom import Dataset
+from pydicom.sequence import Sequence as Items
 from pydicom.uid import generate_uid
 
 from model.errors import InvalidGeometry
 from service.adapters.dicom.masks import stacks_of_object
-from service.adapters.dicom.planes import FramePlane, stack_places
+from service.adapters.dicom.planes import REGULAR_MM, FramePlane, drawn_stacks, stack_places
 from service.adapters.dicom.series import series_of
 from service.adapters.images import ImageLimits
 from tests.dicom_parts import grid_of, mr_series, reread, ring, rtstruct_of, seg_of
@@ -112,11 +116,67 @@ def test_a_sparse_stack_has_the_nominal_step_or_a_part_of_its_smallest_distance(
     assert places * found == pytest.approx(np.array(heights) - min(heights), abs=0.02)
 
 
-def test_planes_that_nearly_coincide_need_no_step_finer_than_they_are_rounded_by():
-    heights = np.array([0.0, 4.0, 4.12, 8.0])
-    places, step = stack_places(sparse(heights))
-    assert step >= 0.1
-    assert places * step == pytest.approx(heights, abs=0.1)
+def heights_of(stacks, count):
+    """Where the planes lie on the grids of their stacks (mm)."""
+    found = np.full(count, np.nan)
+    for stack in stacks:
+        index = np.stack([np.zeros(len(stack.places)), np.zeros(len(stack.places)), stack.places], axis=1)
+        found[stack.numbers] = stack.grid.to_world(index.astype(float))[:, 2]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("heights", "finest"),
+    [
+        ((0.0, 17.0, 34.5), 0.5),
+        ((0.0, 85.0, 235.0), 5.0),
+        ((0.0, 20.0, 47.0), 1.0),
+        ((0.0, 21.25, 46.25), 1.25),
+        ((0.0, 35.0, 71.5), 0.5),
+        ((0.0, 114.0, 276.0), 6.0),
+    ],
+)
+def test_a_step_is_as_fine_as_planes_far_apart_need_it(heights, finest):
+    (stack,) = drawn_stacks(sparse(heights, 5.1), 8, 8, 1 << 22)
+    assert stack.grid.spacing[2] > finest - REGULAR_MM
+    assert heights_of([stack], 3) == pytest.approx(np.array(heights), abs=REGULAR_MM)
+
+
+@given(
+    st.lists(st.floats(0.3, 90.0), min_size=1, max_size=8),
+    st.sampled_from([np.nan, 0.8, 3.0]),
+    st.sampled_from([0.0, 20.0]),
+    st.randoms(use_true_random=False),
+)
+@settings(deadline=None)
+def test_planes_at_any_distances_lie_where_they_were_drawn(gaps, depth, room_mm, random):
+    heights = np.cumsum([-7.3, *gaps])
+    random.shuffle(heights)
+    stacks = drawn_stacks(sparse(heights, depth), 40, 30, 1 << 22, room_mm)
+    assert sorted(np.concatenate([stack.numbers for stack in stacks])) == list(range(len(heights)))
+    assert heights_of(stacks, len(heights)) == pytest.approx(heights, abs=REGULAR_MM + 1e-6)
+    assert sum(np.prod(stack.grid.shape) for stack in stacks) <= 1 << 22
+    first = stacks[0].grid.to_world(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, stacks[0].grid.shape[2] - 1.0]]))[:, 2]
+    assert first[0] <= heights.min() - room_mm + REGULAR_MM
+    assert first[1] >= heights.max() + room_mm - REGULAR_MM
+
+
+def test_planes_that_no_step_fits_are_stacks_by_themselves():
+    heights = (0.0, 4.0, 4.17, 4.18, 8.31, 13.07)
+    assert stack_places(sparse(heights)) is None
+    stacks = drawn_stacks(sparse(heights), 8, 8, 1 << 22)
+    assert [stack.numbers.tolist() for stack in stacks] == [[0], [1], [2, 3], [4], [5]]
+    assert heights_of(stacks, 6) == pytest.approx(np.array(heights), abs=REGULAR_MM)
+    assert [stack.grid.shape[2] for stack in stacks] == [28, 1, 1, 1, 1]
+    assert stacks[0].grid.spacing[2] == pytest.approx(0.5)
+
+
+def test_no_step_is_tried_that_takes_more_voxels_than_are_accepted():
+    heights = (0.0, 17.0, 34.5)
+    assert len(drawn_stacks(sparse(heights, 5.0), 8, 8, 8 * 8 * 80)) == 1
+    stacks = drawn_stacks(sparse(heights, 5.0), 8, 8, 8 * 8 * 20)
+    assert len(stacks) == 3
+    assert heights_of(stacks, 3) == pytest.approx(np.array(heights))
 
 
 def moved(images, numbers, by):
@@ -174,3 +234,34 @@ def test_one_multi_frame_image_is_accepted_and_several_are_refused():
         series_of([converted(images[:4], 1), converted(images[4:], 2)])
     with pytest.raises(InvalidGeometry, match="multi-frame ones among them"):
         series_of([converted(images[:4], 1), *images[4:]])
+
+
+def volume_of_its_own():
+    """A multi-frame image whose frames lie in the coordinates of its volume, as those of ultrasound do."""
+    image, frames = reread(mr_series((12, 10, 1))[0]), []
+    for number in range(4):
+        frame, position = Dataset(), Dataset()
+        position.ImagePositionVolume = [0, 0, number]
+        frame.PlanePositionVolumeSequence = Items([position])
+        frames.append(frame)
+    shared, orientation, measures = Dataset(), Dataset(), Dataset()
+    orientation.ImageOrientationVolume, measures.PixelSpacing = [1, 0, 0, 0, 1, 0], [1, 1]
+    shared.PlaneOrientationVolumeSequence, shared.PixelMeasuresSequence = Items([orientation]), Items([measures])
+    image.SharedFunctionalGroupsSequence, image.PerFrameFunctionalGroupsSequence = Items([shared]), Items(frames)
+    return [image]
+
+
+def without_position():
+    images = mr_series((12, 10, 4))
+    del images[2].ImagePositionPatient
+    return images
+
+
+@pytest.mark.parametrize("images", [volume_of_its_own, without_position])
+def test_images_without_planes_in_the_patient_are_refused(images):
+    said = (
+        r"^series has a frame without a plane in the patient's coordinates; frames with Image Position \(Patient\), "
+        r"Image Orientation \(Patient\) and Pixel Spacing are accepted$"
+    )
+    with pytest.raises(InvalidGeometry, match=said):
+        series_of(images())

@@ -16,6 +16,7 @@ from model.inference.reconstruction import Options
 from model.inference.uncertainty import voxel_entropy
 from service import use_cases
 from service.adapters.dicom.derivation import Derivation, anatomy_of
+from service.adapters.dicom.laterality import SIDES, UNPAIRED
 from service.adapters.dicom.masks import stacks_of_object
 from service.adapters.dicom.results import RESULTS, result_objects
 from service.adapters.dicom.series import series_of
@@ -215,6 +216,47 @@ def test_one_structure_of_several_is_told_by_its_number_and_name(derived):
         .tracking_identifier
         == "right"
     )
+
+
+@pytest.mark.parametrize("said_mm", [5.0, 1.02, -1.0])
+def test_planes_are_as_far_apart_as_they_lie_whatever_the_images_say(said_mm, tmp_path):
+    images = mr_series()
+    for image in images:
+        image.SpacingBetweenSlices = said_mm
+    results = result_objects(*derive(images), MOMENT_S)
+    volume = hd.seg.Segmentation.from_dataset(reread(results["segmentation"])).get_volume()
+    chart = hd.pm.ParametricMap.from_dataset(reread(results["occupancy"])).get_volume()
+    assert volume.spacing == pytest.approx((1.0, 1.0, 1.0))
+    assert chart.spacing == pytest.approx((1.0, 1.0, 1.0))
+    if shutil.which("dciodvfy") is not None:
+        assert [error for found in results.values() for error in checker_errors(file_bytes(found), tmp_path)] == []
+
+
+def test_results_say_the_side_where_it_is_known(derived, tmp_path):
+    derivation, probability = derived
+    left = replace(derivation, side="L")
+    results = {name: reread(found) for name, found in result_objects(left, probability, MOMENT_S).items()}
+    for name in ("segmentation", "surface"):
+        (segment,) = results[name].SegmentSequence
+        (kind,) = segment.SegmentedPropertyTypeCodeSequence
+        assert kind.SegmentedPropertyTypeModifierCodeSequence[0].CodeValue == SIDES["L"].value
+        assert segment.SegmentLabel == "ellipsoid, left"
+    for name in ("occupancy", "entropy"):
+        (anatomy,) = results[name].SharedFunctionalGroupsSequence[0].FrameAnatomySequence
+        assert anatomy.FrameLaterality == "L"
+    report = hd.sr.Comprehensive3DSR.from_dataset(results["report"])
+    (group,) = report.content.get_volumetric_roi_measurement_groups()
+    assert group.finding_sites[0].laterality.value == SIDES["L"].value
+    if shutil.which("dciodvfy") is not None:
+        assert [error for found in results.values() for error in checker_errors(file_bytes(found), tmp_path)] == []
+
+
+def test_no_side_is_claimed_where_none_is_known(objects):
+    for name in ("occupancy", "entropy"):
+        assert objects[name].SharedFunctionalGroupsSequence[0].FrameAnatomySequence[0].FrameLaterality == UNPAIRED
+    for name in ("segmentation", "surface"):
+        (kind,) = objects[name].SegmentSequence[0].SegmentedPropertyTypeCodeSequence
+        assert "SegmentedPropertyTypeModifierCodeSequence" not in kind
 
 
 @pytest.mark.parametrize("labels", [None, frozenset({1})])

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pydicom.sequence import Sequence as Items
 from pydicom.uid import generate_uid
 
 from model.errors import InvalidGeometry, InvalidMask, InvalidParameter
-from service.adapters.dicom.masks import frame_of_reference, referenced_series, stacks_of_object
+from service.adapters.dicom.masks import drawn_labels, frame_of_reference, referenced_series, stacks_of_object
 from service.adapters.dicom.series import series_of
 from service.adapters.images import ImageLimits
 from tests.dicom_parts import mr_series, name_images, reread, ring, rtstruct_of, seg_of, with_region
@@ -108,10 +110,56 @@ def test_a_contour_beside_the_images_is_refused(images):
         filled(images, [square(images, 5.0), square(images, 3.0, (80.0, 0.0))])
 
 
-def test_a_contour_around_nothing_is_refused(images):
-    line = square(images, 5.0)[:1] + np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
-    with pytest.raises(InvalidGeometry, match="closed contour around no area"):
-        filled(images, [square(images, 5.0), line])
+SLIVERS = {
+    "on a line": [(0.0, 0.0), (2.0, 0.0), (4.0, 0.0)],
+    "on a slanting line": [(0.0, 0.0), (1.37, 0.411), (2.74, 0.822), (4.11, 1.2330001)],
+    "of one point": [(1.0, 1.0)] * 3,
+    "of one point far away": [(1000.0, 1.0)] * 4,
+    "there and back": [(0.0, 0.0), (4.0, 1.0), (6.0, 3.0), (4.0, 1.0)],
+    "a figure of eight": [(0.0, 0.0), (3.0, 3.0), (3.0, 0.0), (0.0, 3.0)],
+}
+
+
+@pytest.fixture(params=SLIVERS, ids=list(SLIVERS))
+def sliver(request, images):
+    return square(images, 5.0)[:1] + np.array([(*point, 0.0) for point in SLIVERS[request.param]])
+
+
+@pytest.mark.parametrize("kind", ["CLOSED_PLANAR", "CLOSEDPLANAR_XOR"])
+def test_a_contour_without_an_area_is_passed_over(images, sliver, kind):
+    alone = filled(images, [square(images, 5.0)], kind)
+    assert (filled(images, [sliver, square(images, 5.0)], kind) == alone).all()
+
+
+def test_a_region_of_contours_without_an_area_draws_nothing(images, sliver):
+    empty = rtstruct_of(images, [("CLOSED_PLANAR", sliver)])
+    both = with_region(rtstruct_of(images, [("CLOSED_PLANAR", square(images, 5.0))]), empty, number=7)
+    assert drawn_labels(both, "mask[0]") == {1}
+    said = "mask[0] holds no closed planar contour around an area of region {}; one or more are needed"
+    for found, labels, number in ((both, frozenset({7}), 7), (empty, None, 1)):
+        with pytest.raises(InvalidMask) as caught:
+            stacks_of_object(found, "mask[0]", LIMITS, labels)
+        assert str(caught.value) == said.format(number)
+
+
+def test_a_contour_smaller_than_a_pixel_has_an_area(images):
+    tiny = square(images, 0.002)
+    assert filled(images, [square(images, 5.0, number=8), tiny]).sum() == 1
+
+
+@given(st.lists(st.floats(0.3, 60.0), min_size=1, max_size=5))
+@settings(deadline=None, max_examples=25)
+def test_contours_at_any_distances_lie_where_they_were_drawn(gaps):
+    images = mr_series((36, 30, 2))
+    heights = np.round(np.cumsum([-20.0, *gaps]), 3)
+    base = np.round(square(images, 6.0, number=0), 3)
+    drawn = [("CLOSED_PLANAR", np.column_stack([base[:, :2], np.full(4, height)])) for height in heights]
+    stacks = stacks_of_object(reread(rtstruct_of(images, drawn)), "mask[0]", LIMITS)
+    found = []
+    for stack in stacks:
+        places = np.argwhere(stack.foreground.any(axis=(0, 1))).astype(float)
+        found += stack.grid.to_world(np.pad(places, ((0, 0), (2, 0))))[:, 2].tolist()
+    assert sorted(found) == pytest.approx(heights, abs=0.021)
 
 
 def test_regions_that_are_not_there_are_named(images):
