@@ -370,7 +370,7 @@ def stack_at_home(
 
 
 def on_images(home: Grid, places: Int[np.ndarray, "n"], most_voxels: float) -> DrawnStack:
-    """Planes drawn on images, on the grid of all of these; from the first to the last drawn one where that is too large.
+    """Planes drawn on images, on the grid of all of these; of the first to the last drawn one where that is too large.
 
     Args:
         places: indices along the last axis of the images' grid.
