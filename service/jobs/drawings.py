@@ -17,11 +17,13 @@ from model.errors import InputError, NotFound
 from model.inference.reconstruction import Options
 from service import use_cases
 from service.adapters.dicom.derivation import Derivation, anatomy_of
+from service.adapters.dicom.laterality import side_of
 from service.adapters.dicom.masks import stacks_of_object
 from service.adapters.dicom.results import result_objects
-from service.adapters.dicom.series import series_of
+from service.adapters.dicom.series import around, series_of
 from service.adapters.image_guard import ImageLimits
 from service.adapters.pacs.configuration import Rule
+from service.adapters.pacs.contents import content_digest
 from service.adapters.pacs.delivery import Desk
 from service.errors import ArchiveRefused, ArchiveUnavailable, Cancelled, GivenUp
 from service.job_ports import Check, JobKind, JobRun, Record
@@ -156,9 +158,11 @@ def _reconstruct(tools: DrawingTools, item: Record, check: Check) -> Record:
     stacks = stacks_of_object(drawing, "object", tools.limits, labels, series.grid)
     model = tools.registry.get(rule.model)
     outcome = use_cases.reconstruct(model, stacks, _options(rule), tools.limits.max_voxels, check=check)
+    series = around(series, outcome.reconstruction.mesh)
     outcome = replace(outcome, grid=series.grid)
-    key = _key(str(drawing.SOPInstanceUID), outcome, labels)
-    derivation = Derivation(drawing, series, outcome, anatomy_of(model.manifest), key, tools.version, labels)
+    key = _key(str(drawing.SOPInstanceUID), content_digest(drawing, stacks, labels), outcome, labels)
+    anatomy, side = anatomy_of(model.manifest), side_of(drawing, labels)
+    derivation = Derivation(drawing, series, outcome, anatomy, key, tools.version, labels, side)
     volume = use_cases.probability_map(tools.registry, outcome, None, tools.limits.max_voxels)
     results = result_objects(derivation, volume.array, desk.moment_s(item["object"]))
     desk.put_results(item["object"], results)
@@ -186,7 +190,7 @@ def _options(rule: Rule) -> Options:
     return Options("auto", rule.uncertainty, rule.mirror, None, rule.seed)
 
 
-def _key(source: str, outcome: Outcome, labels: frozenset[int] | None) -> str:
-    """Decides all identifiers of the results: the source, the model and the settings."""
-    content = f"{source}\n{outcome.model_digest}\n{outcome.options}\n{sorted(labels or ())}"
-    return hashlib.sha256(content.encode()).hexdigest()
+def _key(source: str, content: str, outcome: Outcome, labels: frozenset[int] | None) -> str:
+    """Decides all identifiers of the results: the source and what it draws, the model and the settings."""
+    key = f"{source}\n{content}\n{outcome.model_digest}\n{outcome.options}\n{sorted(labels or ())}"
+    return hashlib.sha256(key.encode()).hexdigest()

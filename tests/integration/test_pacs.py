@@ -6,7 +6,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
+from pydicom.uid import RLELossless
 
 from benchmarks.pacs.orthanc import is_installed
 from benchmarks.ports import free_ports
@@ -83,8 +85,69 @@ def test_the_same_drawing_twice_gives_results_once(orthanc, tmp_path):
         service.inbox.receive(file_bytes(drawing), "OTHER")
         service.until_empty()
         service.inbox.receive(file_bytes(reread(drawing)), "VIEWER")
-        assert service.inbox.backlog() == 0
+        service.until_empty()
     assert len(results_in(orthanc, images[0].StudyInstanceUID)) == len(RESULTS)
+
+
+def test_a_corrected_drawing_has_results_of_its_own(orthanc, tmp_path):
+    images, drawing = new_study(orthanc, tmp_path)
+    corrected = reread(drawing)
+    shifted = np.roll(corrected.pixel_array.astype(bool), 2, axis=2)
+    corrected.PixelData = np.packbits(shifted.ravel(), bitorder="little").tobytes()
+    service = service_with(tmp_path, by_dicomweb(orthanc))
+    with service.working():
+        for sent in (drawing, corrected, corrected, drawing):
+            service.inbox.receive(file_bytes(sent), "VIEWER")
+            service.until_empty()
+    results = results_in(orthanc, images[0].StudyInstanceUID)
+    assert len(results) == 2 * len(RESULTS)
+    surfaces = [found.SurfaceSequence[0].SurfacePointsSequence[0] for found in results if "SurfaceSequence" in found]
+    left, right = sorted(np.frombuffer(points.PointCoordinatesData, "<f4")[::3].mean() for points in surfaces)
+    assert right - left == pytest.approx(2 * float(images[0].PixelSpacing[1]), abs=0.2)
+
+
+def test_the_same_drawing_in_another_form_gives_results_once(orthanc, tmp_path):
+    images, _ = new_study(orthanc, tmp_path)
+    drawing = seg_of(images, sparse_ellipsoid()[0].astype(np.uint8), "LABELMAP")
+    renamed, packed = reread(drawing), reread(drawing)
+    renamed.PatientName = "Renamed^At^Archive"
+    packed.compress(RLELossless, generate_instance_uid=False)
+    service = service_with(tmp_path, by_dicomweb(orthanc))
+    with service.working():
+        for sent in (drawing, renamed, packed):
+            assert service.inbox.receive(file_bytes(sent), "VIEWER").disposition is Disposition.ACCEPTED
+            service.until_empty()
+    assert service.reasons() == []
+    assert len(results_in(orthanc, images[0].StudyInstanceUID)) == len(RESULTS)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_results_that_the_archive_lost_come_back_with_the_drawing(way, orthanc, tmp_path):
+    images, drawing = new_study(orthanc, tmp_path)
+    service = service_with(tmp_path, WAYS[way](orthanc))
+    made = []
+    with service.working():
+        for _ in range(2):
+            service.inbox.receive(file_bytes(drawing), "VIEWER")
+            service.until_empty()
+            made.append({found.SOPInstanceUID for found in results_in(orthanc, images[0].StudyInstanceUID)})
+            for item in orthanc.instances(images[0].StudyInstanceUID):
+                if item["SOPInstanceUID"] in made[0]:
+                    orthanc.client.delete(f"/instances/{item['ID']}").raise_for_status()
+    assert len(made[0]) == len(RESULTS)
+    assert made[1] == made[0]
+
+
+@pytest.mark.parametrize("changed", [{"seed": 1}, {"mirror": "auto"}])
+def test_a_drawing_that_is_sent_again_is_worked_on_as_the_rule_is_by_then(changed, orthanc, tmp_path):
+    images, drawing = new_study(orthanc, tmp_path)
+    for settings in ({}, changed):
+        service = service_with(tmp_path, by_dicomweb(orthanc), **settings)
+        service.inbox.receive(file_bytes(drawing), "VIEWER")
+        assert service.inbox.backlog() == 1
+        with service.working():
+            service.until_empty()
+    assert len(results_in(orthanc, images[0].StudyInstanceUID)) == 2 * len(RESULTS)
 
 
 def test_another_installation_makes_the_same_objects(orthanc, tmp_path):
@@ -172,7 +235,8 @@ def test_nothing_is_made_of_half_a_series(way, orthanc, tmp_path):
         service.until_empty()
     results = results_in(orthanc, images[0].StudyInstanceUID)
     assert len(results) == len(RESULTS)
-    assert {int(found.NumberOfFrames) for found in results if found.Modality == "OT"} == {len(images)}
+    (frames,) = {int(found.NumberOfFrames) for found in results if found.Modality == "OT"}
+    assert 18 < frames <= len(images)
 
 
 def test_a_drawing_in_quarantine_is_released_when_it_is_sent_again(orthanc, tmp_path):
@@ -192,7 +256,8 @@ def test_a_drawing_in_quarantine_is_released_when_it_is_sent_again(orthanc, tmp_
         service.until_empty()
         assert service.inbox.quarantined() == 0
         service.inbox.receive(file_bytes(drawing), "VIEWER")  # once more, after the results
-        assert service.inbox.backlog() == 0
+        service.until_empty()
+        assert service.inbox.quarantined() == 0
     assert len(results_in(orthanc, images[0].StudyInstanceUID)) == len(RESULTS)
 
 

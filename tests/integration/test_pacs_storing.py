@@ -12,6 +12,7 @@ from pydicom import Dataset
 from benchmarks.ports import free_ports
 from service.adapters.dicom.results import RESULTS
 from service.adapters.pacs.configuration import Listener, PacsConfiguration, Rule
+from service.adapters.pacs.inbox import INBOX
 from service.pacs_ports import Disposition
 from tests.dicom_parts import file_bytes
 from tests.pacs_archives import TITLE, FakeArchive
@@ -78,6 +79,43 @@ def test_what_is_there_already_counts_as_stored(tmp_path):
     assert len(archive.offered) == 2 * len(RESULTS)
     assert len(archive.stored) == len(RESULTS)
     assert service.reasons() == []
+
+
+def test_a_drawing_that_is_sent_again_goes_to_the_archives_of_the_rule_by_then(tmp_path):
+    images, drawing = drawn_series()
+    source, target = FakeArchive(images), FakeArchive([])
+    archives = (source.settings(), target.settings().model_copy(update={"name": "target"}))
+    with source.running(), target.running():
+        for send_to in (("archive",), ("archive", "target")):
+            rule = Rule(name="all", model="ellipsoid", fetch_from="archive", send_to=send_to)
+            service = Service(tmp_path, PacsConfiguration(archives=archives, rules=(rule,)), io.StringIO())
+            service.inbox.receive(file_bytes(drawing), "VIEWER")
+            with service.working():
+                service.until_empty()
+    assert source.stored == target.stored
+    assert len(set(target.stored)) == len(target.stored) == len(RESULTS)
+
+
+def test_a_drawing_that_is_waited_on_is_not_begun_again(tmp_path):
+    images, drawing = drawn_series()
+    archive = FakeArchive(images)
+    service = service_with(tmp_path, archive.settings())
+    service.inbox.receive(file_bytes(drawing), "VIEWER")
+    (first,) = service.blobs.folders(f"{INBOX}/")
+    with service.working():
+        with archive.running():
+            service.until_empty()
+        until(lambda: service.jobs.status(first).state.is_final)
+        service.inbox.receive(file_bytes(drawing), "VIEWER")  # the archive is away
+        (second,) = service.blobs.folders(f"{INBOX}/")
+        assert second != first
+        until(lambda: "archive awaited" in service.said.getvalue())
+        service.jobs.forget(first)  # as when it has expired
+        service.inbox.receive(file_bytes(drawing), "VIEWER")
+        assert list(service.blobs.folders(f"{INBOX}/")) == [second]
+        with archive.running():
+            service.until_empty()
+    assert len(archive.stored) == len(RESULTS)
 
 
 @dataclass

@@ -8,7 +8,7 @@ import io
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, islice
 from typing import Any
 
 from pydicom import Dataset
@@ -26,6 +26,8 @@ from service.pacs_ports import DRAWING_JOB, Disposition, Receipt
 INBOX, QUARANTINE = "dicom/inbox", "dicom/quarantine"
 #: Files of one received object.
 OBJECT, ARGUMENT, IMAGES, REASON = "object.dcm", "job.json", "images.json", "reason.json"
+#: Jobs of one drawn structure that are asked for at once.
+JOBS_AT_ONCE = 32
 
 
 @dataclass(frozen=True)
@@ -63,17 +65,18 @@ class Inbox:
         """
         data = self.blobs.get(f"{QUARANTINE}/{name}/{OBJECT}")
         told = json.loads(self.blobs.get(f"{QUARANTINE}/{name}/{REASON}"))
-        receipt, drawings = self._take(data, told.get("sender", ""), self.title)
+        receipt, drawings = self._take(data, told.get("sender", ""), self.title, name)
         if receipt.disposition is Disposition.ACCEPTED and name not in drawings:  # by a rule of another name
             self.blobs.delete(f"{QUARANTINE}/{name}/")
         return receipt.disposition
 
-    def _take(self, data: bytes, sender: str, source: str) -> tuple[Receipt, list[str]]:
+    def _take(self, data: bytes, sender: str, source: str, only: str | None = None) -> tuple[Receipt, list[str]]:
         """Make a job of each structure that a rule takes; their names in quarantine, should they come to be there.
 
         Args:
             sender: whom the rules ask about.
             source: who gave the object, in the audit trail.
+            only: name in quarantine of the structure that is meant; all are when it is of none.
         """
         try:
             found = read_object(io.BytesIO(data), "object")
@@ -84,9 +87,14 @@ class Inbox:
             return self._quarantine(data, sender, source, error), []
         drawings = []
         if match is not None:
-            for labels, name in zip(match.structures, drawing_digests(found, match), strict=True):
-                drawings.append(self._accept(data, name, match.rule, labels, sender))
+            for labels, digest in self._meant(found, match, only):
+                drawings.append(self._accept(data, digest, match.rule, labels, sender))
         return self._taken(Header(*named, is_foreign=match is None), source, match), drawings
+
+    def _meant(self, found: Dataset, match: Match, only: str | None) -> list[tuple[frozenset[int] | None, str]]:
+        """Numbers and digests of the structures that are taken."""
+        structures = list(zip(match.structures, drawing_digests(found, match), strict=True))
+        return [pair for pair in structures if self.jobs.new_id(DRAWING_JOB, pair[1]) == only] or structures
 
     def take_up(self) -> None:
         """Make jobs of what a killed service had written down and not enqueued; its sender was not told anything."""
@@ -123,20 +131,15 @@ class Inbox:
         return Receipt(Disposition.MISPLACED, *uids)
 
     def _accept(self, data: bytes, digest: str, rule: Rule, labels: frozenset[int] | None, sender: str) -> str:
-        """On disk first, then the job; what a job is at work on, or has given back the results of, is left to it.
+        """On disk first, then the job; what a job waits for or is at work on is left to it.
 
         Returns:
             The name of the drawn structure in quarantine.
         """
         drawing = self.jobs.new_id(DRAWING_JOB, digest)
-        fruitless: list[str] = []
-        for identifier in self._identifiers(digest):
-            status = self._status(identifier)
-            if status is None:
-                break
-            if not self._is_fruitless(status, drawing):
-                return drawing
-            fruitless.append(identifier)
+        earlier, identifier = self._jobs_of(digest)
+        if earlier and not self._has_ended(earlier[-1]):
+            return drawing
         argument: Record = {
             "object": identifier,
             "drawing": drawing,
@@ -148,25 +151,45 @@ class Inbox:
         self.blobs.put(f"{INBOX}/{identifier}/{OBJECT}", data)
         self.blobs.put(f"{INBOX}/{identifier}/{ARGUMENT}", json.dumps(argument).encode())
         self.jobs.enqueue(DRAWING_JOB, argument, identifier)
-        self._release(drawing, fruitless)
+        self._release(drawing, earlier)
         return drawing
 
     def _identifiers(self, digest: str) -> Iterator[str]:
-        """Of the first job of a drawn structure, and of those that follow one without results."""
+        """Of the first job of a drawn structure, and of those that follow when it is sent again."""
         yield self.jobs.new_id(DRAWING_JOB, digest)
         for number in count(2):
             yield self.jobs.new_id(DRAWING_JOB, f"{digest}\n{number}")
 
-    def _is_fruitless(self, status: JobStatus, drawing: str) -> bool:
-        """Whether a job has ended, or is about to, without giving anything back."""
-        if status.state.is_final:
-            return not (status.result or {}).get("stored")
-        is_aside = self.blobs.exists(f"{QUARANTINE}/{drawing}/{OBJECT}")
-        return is_aside and not self.blobs.exists(f"{INBOX}/{status.id}/{OBJECT}")
+    def _jobs_of(self, digest: str) -> tuple[list[str], str]:
+        """The jobs of a drawn structure so far, and the identifier of the one to come.
 
-    def _release(self, drawing: str, fruitless: Sequence[str]) -> None:
+        Records of the first ones may have expired while the last one still waits for an archive.
+        """
+        earlier: list[str] = []
+        coming = ""
+        for identifier, is_known in self._known(self._identifiers(digest)):
+            if is_known:
+                earlier.append(identifier)
+            coming = "" if is_known else coming or identifier
+        return earlier, coming
+
+    def _known(self, identifiers: Iterator[str]) -> Iterator[tuple[str, bool]]:
+        """Whether jobs have records, to the end of the first lot of which none has."""
+        known = {""}
+        while known:
+            lot = list(islice(identifiers, JOBS_AT_ONCE))
+            known = self.jobs.known(lot)
+            yield from ((identifier, identifier in known) for identifier in lot)
+
+    def _has_ended(self, identifier: str) -> bool:
+        """Whether a job has ended, or is about to: its last step removes the drawing."""
+        status = self._status(identifier)
+        is_over = status is None or status.state.is_final
+        return is_over or not self.blobs.exists(f"{INBOX}/{identifier}/{OBJECT}")
+
+    def _release(self, drawing: str, earlier: Sequence[str]) -> None:
         """What was sent again is in quarantine no more, nor in the backlog on account of jobs that failed."""
-        for identifier in fruitless:
+        for identifier in earlier:
             self.blobs.delete(f"{INBOX}/{identifier}/")
         if self.blobs.exists(f"{QUARANTINE}/{drawing}/{OBJECT}"):
             self.blobs.delete(f"{QUARANTINE}/{drawing}/")

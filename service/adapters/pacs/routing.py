@@ -1,5 +1,6 @@
 """From an incoming object to the rule that takes it, by what its header says."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -75,19 +76,23 @@ def _structures(rule: Rule, wanted: frozenset[int], found: Dataset) -> tuple[fro
 
 
 def _segments(found: Dataset) -> list[Segment]:
-    names = label_names(found, "object")
+    names, coded = label_names(found, "object"), _coded(found)
+    return [Segment(number, name, coded.get(number, frozenset())) for number, name in names.items()]
+
+
+def _coded(found: Dataset) -> dict[int, frozenset[str]]:
+    """Codes of the segments or regions by number; a region has those of all observations of it (PS3.3, C.8.8.8)."""
+    number = "SegmentNumber"
+    names: tuple[str, ...] = ("SegmentedPropertyTypeCodeSequence", "AnatomicRegionSequence")
     if found.SOPClassUID == RTStructureSetStorage:
-        observed = {
-            int(item.ReferencedROINumber): _codes(item, "RTROIIdentificationCodeSequence")
-            for item in found.get("RTROIObservationsSequence") or []
-        }
+        items = found.get("RTROIObservationsSequence") or []
+        number, names = "ReferencedROINumber", ("RTROIIdentificationCodeSequence",)
     else:
-        observed = {
-            int(item.SegmentNumber): _codes(item, "SegmentedPropertyTypeCodeSequence")
-            | _codes(item, "AnatomicRegionSequence")
-            for item in found.SegmentSequence
-        }
-    return [Segment(number, name, observed.get(number, frozenset())) for number, name in names.items()]
+        items = found.SegmentSequence
+    coded: defaultdict[int, frozenset[str]] = defaultdict(frozenset)
+    for item in items:
+        coded[int(item[number].value)] |= frozenset[str]().union(*(_codes(item, name) for name in names))
+    return coded
 
 
 def _codes(item: Dataset, name: str) -> frozenset[str]:

@@ -1,7 +1,9 @@
 """Which objects go to which model, and which are left alone."""
 
+import highdicom as hd
 import numpy as np
 import pytest
+from pydicom import Dataset
 
 from model.errors import InvalidMask, InvalidParameter
 from service.adapters.dicom.masks import referenced_series
@@ -77,6 +79,24 @@ def test_regions_are_structures_too(images):
     match = find_rule([rule(segment_labels=("hippo*",))], found, "VIEWER")
     assert match is not None
     assert match.structures == ({1}, {7})
+
+
+def test_a_region_has_the_codes_of_all_observations_of_it(images):
+    found = rtstruct_of(images, contours_at(images, (2, 3)))
+    found.RTROIObservationsSequence = [observation(1, "5366008"), observation(2, "71341001"), observation(3)]
+    for code in ("SCT:5366008", "SCT:71341001"):
+        match = find_rule([rule(segment_codes=(code,))], reread(found), "VIEWER")
+        assert match is not None
+        assert match.structures == ({1},)
+    assert find_rule([rule(segment_codes=("SCT:40238009",))], reread(found), "VIEWER") is None
+
+
+def observation(number, code=None):
+    found = Dataset()
+    found.ObservationNumber, found.ReferencedROINumber = number, 1
+    if code is not None:
+        found.RTROIIdentificationCodeSequence = [hd.sr.CodedConcept(code, "SCT", "structure")]
+    return found
 
 
 def contours_at(images, places):
