@@ -137,6 +137,7 @@ class Metrics:
         )
         self._gauge("morphoflow_work_waiting", "Requests that wait for a worker", engine.waiting)
         self.watch("morphoflow_jobs_waiting_parts", "Parts of jobs that wait for a worker", jobs.backlog)
+        self.watch("morphoflow_jobs_unfinished", "Jobs that wait or run, but for archives", jobs.unfinished)
         self._gauge("morphoflow_work_running", "Workers that are busy", engine.running)
         ProcessCollector(registry=self._registry)
 

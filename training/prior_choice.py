@@ -33,8 +33,9 @@ CASES = 24
 #: A prior is as good when its error, and twice the standard error of the difference more, is no more than this share
 #: above that of the model as it was trained.
 MARGIN = 0.002
-#: Models that are measured at most: the trained one with every precision, and two fitted ones.
-MODELS = len(PRECISIONS) + 2
+#: Fitted priors that are measured at most; the trained model is with every precision.
+FITTED = 2
+MODELS = len(PRECISIONS) + FITTED
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from math import ceil
 from pathlib import Path
 
 from service.adapters.archive import MESH, STATE, SUMMARY, moment, parse_document, write_outcome
@@ -90,7 +91,7 @@ class BlobResultStore:
     def _write(self, name: str, outcome: Outcome, times: dict[str, float]) -> None:
         with tempfile.TemporaryDirectory() as folder:
             write_outcome(Path(folder), outcome, times)
-            self._blobs.put(f"expiry/{int(times['expires']):012d}/{name}", b"")
+            self._blobs.put(f"expiry/{ceil(times['expires']):012d}/{name}", b"")
             for file in (STATE, MESH, SUMMARY):
                 with (Path(folder) / file).open("rb") as content:
                     self._blobs.put_file(f"results/{name}/{file}", content)

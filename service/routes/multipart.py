@@ -3,14 +3,20 @@
 from fastapi import Request
 from python_multipart.multipart import parse_options_header
 from starlette.datastructures import FormData
+from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import Message
 
+from model.errors import TooLarge
 from service.errors import Abandoned, StoreFull, UnsupportedMediaType
 from service.full_disks import is_full
 from service.routes.problems import MalformedBody
 
 MEDIA_TYPE = b"multipart/form-data"
+#: Fields of a body that are no files, at most.
+MOST_FIELDS = 64
+#: How the reader of forms begins to say that there are more files than it was told to take.
+TOO_MANY_FILES = "Too many files"
 CUT_OFF = (
     "The request's body is cut off: the boundary that closes multipart/form-data (--BOUNDARY--) is missing; send the "
     "whole body."
@@ -38,15 +44,25 @@ def require_plain(request: Request) -> None:
         raise UnsupportedMediaType("The request's body must be sent as it is, without the header Content-Encoding.")
 
 
-async def read_form(request: Request) -> FormData:
+async def read_form(request: Request, most_files: int) -> FormData:
     """The parts of a body; the request keeps them for whoever asks again.
 
+    Parts are held in memory up to a megabyte each, so many small ones are refused while they arrive.
+
+    Args:
+        most_files: that any request may hold.
+
     Raises:
+        TooLarge: more files.
         Abandoned: the client went away first.
         StoreFull: the disk of temporary files has no room for the body.
     """
     try:
-        return await request.form()
+        return await request.form(max_files=most_files + 1, max_fields=MOST_FIELDS)
+    except HTTPException as fault:
+        if str(fault.detail).startswith(TOO_MANY_FILES):
+            raise TooLarge(f"At most {most_files} parts named mask are accepted.", part="mask") from fault
+        raise
     except ClientDisconnect:
         raise Abandoned("The client went away before its request was read.") from None
     except OSError as fault:

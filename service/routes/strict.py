@@ -32,7 +32,7 @@ class StrictRoute(APIRoute):
             if not form:
                 return await handle(request)
             whole = with_whole_body(request)
-            parts = await read_form(whole)
+            parts = await read_form(whole, request.app.state.services.settings.max_masks)
             try:
                 require_known([name for name, _ in parts.multi_items()], form)
             except InvalidParameter:

@@ -150,6 +150,15 @@ def test_kubernetes_beside_an_archive_patches_what_is_there(repository: Path) ->
     assert DIMSE in [entry["port"] for entry in policy["ports"]]
 
 
+@pytest.mark.parametrize("file", ["service.yaml", "workers.yaml"])
+def test_no_pod_is_told_of_services_by_variables_that_are_settings(file: str, repository: Path) -> None:
+    """A Service that is called morphoflow would make MORPHOFLOW_PORT an address."""
+    found = objects(repository / "docker" / "kubernetes" / file)
+    pods = [item["spec"]["template"]["spec"] for item in found.values() if "template" in item["spec"]]
+    assert pods
+    assert not any(pod.get("enableServiceLinks", True) for pod in pods)
+
+
 def objects(path: Path) -> dict[tuple[str, str], Any]:
     """Objects of a file for Kubernetes by kind and name."""
     found = yaml.safe_load_all(path.read_text())

@@ -208,7 +208,9 @@ def test_as_many_jobs_wait_as_may(tmp_path):
         refused = client.post(JOBS, files=form(kind="samples"))
         assert refused.status_code == 503
         assert int(refused.headers["retry-after"]) > 0
-        assert "morphoflow_jobs_waiting_parts 0.0" in client.get("/metrics").text
+        figures = client.get("/metrics").text
+        assert "morphoflow_jobs_waiting_parts 0.0" in figures
+        assert "morphoflow_jobs_unfinished 1.0" in figures
 
 
 def test_a_job_whose_result_was_deleted_says_so_and_leads_nowhere(client):

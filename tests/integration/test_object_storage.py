@@ -67,6 +67,16 @@ def test_results_survive_and_expire(blobs):
     assert list(blobs.list("results/")) == []
 
 
+@pytest.mark.parametrize("looked_at", [1010.3, 1010.7, 1010.71, 1011.0])
+def test_a_result_that_ends_between_two_seconds_is_removed_whenever_it_is_looked_for(blobs, looked_at):
+    now = [1000.7]
+    store = BlobResultStore(blobs, lifetime_s=10.0, clock=lambda: now[0])
+    store.save(outcome_of())
+    for now[0] in (looked_at, 1012.0):
+        store.sweep()
+    assert [*blobs.list("results/"), *blobs.list("expiry/")] == []
+
+
 def test_a_result_that_was_saved_again_lives_as_long_as_it_says(blobs):
     now = [1000.0]
     store = BlobResultStore(blobs, lifetime_s=100.0, clock=lambda: now[0])

@@ -58,6 +58,22 @@ def test_too_many_masks_are_refused(tmp_path):
         assert problem(client.post(RECONSTRUCTIONS, files=mask_parts(b"a", b"b", b"c")), 413)["part"] == "mask"
 
 
+def test_many_small_files_are_refused_while_they_arrive(tmp_path):
+    """Each part is held in memory up to a megabyte."""
+
+    def parts():
+        for number in range(200):
+            head = f'--b\r\nContent-Disposition: form-data; name="mask"; filename="{number}"\r\n\r\n'
+            yield head.encode() + b"x" * 100_000 + b"\r\n"
+        yield b"--b--\r\n"
+
+    with running(app_for(tmp_path, max_masks=2)) as client:
+        headers = {"Content-Type": "multipart/form-data; boundary=b"}
+        assert problem(client.post(RECONSTRUCTIONS, content=parts(), headers=headers), 413)["part"] == "mask"
+        names = [(f"name{number}", (None, "x")) for number in range(100)]
+        assert problem(client.post(RECONSTRUCTIONS, files=names), 413)["part"] == "body"
+
+
 def test_an_answer_of_too_many_voxels_is_refused(tmp_path):
     with running(app_for(tmp_path, max_voxels=120_000)) as client:
         created = client.post(RECONSTRUCTIONS, files=mask_parts())

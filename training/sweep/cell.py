@@ -5,6 +5,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from training.config import Regime, TrainingConfig
 from training.configuring import configured_for
 from training.evaluate import Method, fills_of, given_bundle, measure
 from training.generation import SAMPLES, generated
-from training.prior_choice import chosen_parts
+from training.prior_choice import FITTED, chosen_parts
 from training.pruning import PriorParts
 from training.release import UNCALIBRATED_PRECISION, active_dimensions, export_run
 from training.report import FIGURES
@@ -117,7 +118,7 @@ def run_cell(
         config = config_of(cell, cohort, effort, device)
         if not is_finished(place.run, cohort, config):
             prepared(cohort, config, place.run).go(lambda step, _: watch("training", step, config.steps))
-        _export(place, cohort, effort, _parts(cell, place, cohort, effort))
+        _export(place, cohort, effort, _parts(cell, place, cohort, effort, watch))
     model = open_bundle(place.bundle, threads=1)
     return result_of(cell, model, cohort, effort, time.perf_counter() - begin, watch)
 
@@ -135,7 +136,7 @@ def parts_of(cell: Cell) -> PriorParts | None:
     return None if cell.prior is PriorName.PLAIN else PriorParts(flow=cell.prior.flow, ard=cell.prior.ard)
 
 
-def _parts(cell: Cell, place: Place, cohort: Cohort, effort: Effort) -> PriorParts | None:
+def _parts(cell: Cell, place: Place, cohort: Cohort, effort: Effort, watch: Watch) -> PriorParts | None:
     """What is fitted, with as much of the training's prior as validation shapes want.
 
     They want it at the likelihood precision that the cell is measured with; one that is not calibrated has but one.
@@ -144,7 +145,13 @@ def _parts(cell: Cell, place: Place, cohort: Cohort, effort: Effort) -> PriorPar
     if parts is None or cell.together or not cohort.validation:
         return parts
     precisions = PRECISIONS if effort.calibrate else (UNCALIBRATED_PRECISION,)
-    return chosen_parts(place.run, parts, cohort.validation, cell.measured_in, precisions).parts
+    numbers, most = count(1), len(precisions) + FITTED
+
+    def advance() -> None:
+        watch("choosing the prior", next(numbers), most)
+
+    watch("choosing the prior", 0, most)
+    return chosen_parts(place.run, parts, cohort.validation, cell.measured_in, precisions, advance).parts
 
 
 def config_of(cell: Cell, cohort: Cohort, effort: Effort, device: DeviceName) -> TrainingConfig:
