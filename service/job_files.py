@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, BinaryIO
 
+from model.interruption import Check, unchecked
 from service.errors import UnknownResult
 from service.job_ports import BlobStore, Record
 from service.ports import ResultStore
@@ -80,9 +81,9 @@ class JobFiles:
         found: dict[str, Any] = json.loads(self._blobs.get(self._note(name)))
         return found
 
-    def remove(self) -> None:
-        """Forget all of it."""
-        self._blobs.delete(f"{self._root}/")
+    def remove(self, check: Check = unchecked) -> None:
+        """Forget all of it; what the check raises ends that early, and it can be gone on with."""
+        self._blobs.delete(f"{self._root}/", check)
 
     def _input(self, number: int, submission: str) -> str:
         return f"{self._inputs(submission)}/{number:08d}"

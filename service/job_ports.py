@@ -6,7 +6,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any, BinaryIO, Protocol
 
-from model.interruption import Check
+from model.interruption import Check, unchecked
 from service.errors import Kind
 
 __all__ = [
@@ -193,6 +193,6 @@ class BlobStore(Protocol):
         """Names of the folders in a folder (``a/``), in no order."""
         ...
 
-    def delete(self, prefix: str) -> None:
-        """Remove everything below a folder."""
+    def delete(self, prefix: str, check: Check = unchecked) -> None:
+        """Remove everything below a folder; what the check raises before a piece of it leaves the rest there."""
         ...

@@ -18,6 +18,8 @@ from service.use_cases import MAX_SEED
 SpacingMm = Annotated[float, Field(ge=0.25, le=10.0, allow_inf_nan=False, description="grid step (mm)")]
 #: Largest label; masks of 32 bits hold it.
 MAX_LABEL = 2**31 - 1
+#: Different planes that a request may name: all those of eight masks of 512 slices.
+MOST_PLANES = 4096
 #: Description of the part `extents`.
 EXTENTS = (
     "extents of the surface to measure, separated by commas: R, A and S along the axes of the body, longest between "
@@ -50,7 +52,7 @@ class ReconstructionForm(_Closed):
     annotated: str = Field(
         "auto",
         description='auto, all, nonempty, or a JSON list of planes such as [{"stack": 0, "axis": 2, "index": 7}]; '
-        "stack is 0 when left out",
+        f"stack is 0 when left out; at most {MOST_PLANES} different planes",
     )
     uncertainty: Literal["laplace", "ensemble", "none"] = Field("laplace", description="how uncertainty is found")
     mirror: Literal["auto", "never", "always"] = Field("never", description="whether left and right are exchanged")
@@ -179,7 +181,7 @@ def parse_annotated(text: str) -> AnnotatedRule | tuple[Plane, ...]:
     """The `annotated` parameter.
 
     Raises:
-        InvalidParameter: neither a rule nor a JSON list of planes.
+        InvalidParameter: neither a rule nor a JSON list of planes, or more than `MOST_PLANES` different ones.
     """
     match text.strip():
         case "auto" | "all" | "nonempty" as rule:
@@ -191,7 +193,13 @@ def parse_annotated(text: str) -> AnnotatedRule | tuple[Plane, ...]:
     if not planes:
         accepted = 'auto, all, nonempty or a JSON list of planes such as [{"stack": 0, "axis": 2, "index": 7}]'
         raise InvalidParameter(f"The parameter annotated must be {accepted}.", part="annotated")
-    return tuple(Plane(plane.stack, plane.axis, plane.index) for plane in planes)
+    named = tuple(Plane(plane.stack, plane.axis, plane.index) for plane in planes)
+    if (count := len(set(named))) > MOST_PLANES:
+        raise InvalidParameter(
+            f"The parameter annotated names {count} different planes; at most {MOST_PLANES} are accepted.",
+            part="annotated",
+        )
+    return named
 
 
 def parse_labels(texts: list[str]) -> frozenset[int] | None:

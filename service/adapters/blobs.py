@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO
 
+from model.interruption import Check, unchecked
+
 _TEMPORARY = ".tmp-"
 
 
@@ -48,8 +50,9 @@ class FolderBlobs:
         except FileNotFoundError:
             return []
 
-    def delete(self, prefix: str) -> None:
-        """Remove everything below a folder."""
+    def delete(self, prefix: str, check: Check = unchecked) -> None:
+        """Remove everything below a folder; the check passes once, before."""
+        check()
         shutil.rmtree(self._path(prefix), ignore_errors=True)
 
     def _write(self, key: str, write: Callable[[BinaryIO], object]) -> None:

@@ -14,6 +14,11 @@ from service.jobs.tools import JobTools, labels_of, options_of
 from service.ports import RECONSTRUCTION_JOB, RECONSTRUCTIONS_JOB, Outcome
 from service.presentation import summary_of
 
+#: Choices of a job that are longer than this (characters of JSON) are kept once, in a note, and not with each part.
+BRIEF = 2048
+#: The note, and the member of the answer to `unpack` that says that there is one.
+_CHOICES = "choices"
+
 
 def reconstruction_kind(tools: JobTools) -> JobKind:
     """The kind of job behind ``Prefer: respond-async``; its result is kept under the job's own identifier."""
@@ -36,10 +41,10 @@ def reconstructions_kind(tools: JobTools) -> JobKind:
     """The kind of job that reconstructs each mask of an archive; one at fault is an entry and stops no other."""
 
     def follow(run: JobRun, argument: Record) -> Record:
-        packed = {"job": run.id, SUBMISSION: argument.get(SUBMISSION, "")}
-        count = run.spread("unpack", [packed], [0])[0]["count"]
+        unpacked = run.spread("unpack", [{**argument, "job": run.id}], [0])[0]
+        count, shared = unpacked["count"], {} if unpacked.get(_CHOICES) else argument
         run.expect(count)
-        run.spread("reconstruct", [{**argument, "job": run.id, "number": number} for number in range(count)])
+        run.spread("reconstruct", [{**shared, "job": run.id, "number": number} for number in range(count)])
         return {"count": count}
 
     parts = {
@@ -67,7 +72,15 @@ def _unpack(tools: JobTools, item: Record, check: Check) -> Record:
     files.put_note("names", {"names": names})
     model = tools.registry.names()
     files.put_note("manifest", {"kind": RECONSTRUCTIONS_JOB, "unit": "mm", "models": list(model)})
-    return {"count": len(names)}
+    return {"count": len(names), **_noted(files, item)}
+
+
+def _noted(files: JobFiles, item: Record) -> Record:
+    """Choices that are too long to go with each part as a note; what `unpack` answers of it."""
+    if len(json.dumps(item)) <= BRIEF:
+        return {}
+    files.put_note(_CHOICES, item)
+    return {_CHOICES: True}
 
 
 def _reconstruct_one(tools: JobTools, item: Record, check: Check) -> Record:
@@ -77,12 +90,13 @@ def _reconstruct_one(tools: JobTools, item: Record, check: Check) -> Record:
     check()
     tools.log.debug("item begun", job=item["job"], item=number)
     name = files.note("names")["names"][number]
+    asked = item if "annotated" in item else files.note(_CHOICES)
     try:
-        outcome = _reconstruct(tools, item, [files.input(number + 1)], check)
+        outcome = _reconstruct(tools, asked, [files.input(number + 1)], check)
     except InputError as error:
         files.put_item(number, {}, _refused(name, error))
     else:
-        _put(tools, files, number, name, item["format"], outcome)
+        _put(tools, files, number, name, asked["format"], outcome)
     return {"made": 1}
 
 

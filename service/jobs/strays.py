@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 
+from model.interruption import Check, unchecked
 from service.job_files import JobFiles, jobs_with_files
 from service.job_ports import BlobStore, JobEngine
 
@@ -20,8 +21,11 @@ class Strays:
         self._looked_at = clock()
         self._suspects: set[str] = set()
 
-    def sweep(self) -> int:
-        """Remove what was astray at the last look and still is, if it is time; how many jobs' files."""
+    def sweep(self, check: Check = unchecked) -> int:
+        """Remove what was astray at the last look and still is, if it is time; how many jobs' files.
+
+        What the check raises ends it before the next piece of files.
+        """
         if self._clock() < self._looked_at + LOOK_EVERY_S:
             return 0
         self._looked_at = self._clock()
@@ -29,6 +33,6 @@ class Strays:
         astray = there - self._jobs.known(there)
         gone = astray & self._suspects
         for job in gone:
-            JobFiles(self._blobs, job).remove()
+            JobFiles(self._blobs, job).remove(check)
         self._suspects = astray - gone
         return len(gone)

@@ -8,13 +8,16 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 
+from model.interruption import Check, unchecked
 from service.adapters.images import write_nifti
 from service.adapters.jobs.worker import WorkerOptions, running_worker
 from service.adapters.mesh_formats import write_mesh
+from service.errors import Cancelled
 from service.job_files import JobFiles
 from service.job_ports import BlobStore, JobEngine, JobKind
 from service.jobs.kinds import all_kinds
@@ -59,6 +62,7 @@ def run_worker(settings: Settings, registry: ModelRegistry, slot: int, log: Log,
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
+    threading.Thread(target=_leave_within, args=(_LEAVE_WITHIN_S, stop), daemon=True).start()
     if attached:
         threading.Thread(target=_stop_with_input, args=(stop,), daemon=True).start()
     stand_back(settings.job_nice)
@@ -68,10 +72,9 @@ def run_worker(settings: Settings, registry: ModelRegistry, slot: int, log: Log,
         strays = Strays(jobs, tools.blobs)
         log.info("worker started", slot=slot)
         while not stop.wait(settings.sweep_interval_s):
-            remove_expired(jobs, tools.blobs, strays, settings.result_lifetime_s, log)
+            remove_expired(jobs, tools.blobs, strays, settings.result_lifetime_s, log, _until(stop))
             with going_on(log, "models cannot be found anew"):
                 registry.refresh()
-        _leave_within(_LEAVE_WITHIN_S)
     log.info("worker stopped", slot=slot)
     sys.stderr.flush()
     os._exit(0)  # threads that follow jobs may wait for a database for ever
@@ -86,11 +89,21 @@ def _pacs_kinds(settings: Settings, tools: JobTools) -> tuple[JobKind, ...]:
     return pacs_kinds(settings, settings.pacs_file, tools.registry, tools.blobs, tools.log)
 
 
-def _leave_within(limit_s: float) -> None:
-    """End this process even if its database is away and nothing can be handed back."""
-    timer = threading.Timer(limit_s, os._exit, (1,))
-    timer.daemon = True
-    timer.start()
+def _leave_within(limit_s: float, stop: threading.Event) -> None:
+    """Once told to stop, end this process even if its database or storage is away and nothing can be handed back."""
+    stop.wait()
+    time.sleep(limit_s)
+    os._exit(1)
+
+
+def _until(stop: threading.Event) -> Check:
+    """What ends a sweep once the worker is told to stop; a later one goes on with the rest."""
+
+    def check() -> None:
+        if stop.is_set():
+            raise Cancelled("The worker was told to stop.")
+
+    return check
 
 
 def _stop_with_input(stop: threading.Event) -> None:
@@ -98,14 +111,25 @@ def _stop_with_input(stop: threading.Event) -> None:
     stop.set()
 
 
-def remove_expired(jobs: JobEngine, blobs: BlobStore, strays: Strays, lifetime_s: float, log: Log) -> None:
-    """Forget jobs that ended so long ago, with their files, and files that belong to no job."""
-    with going_on(log, "expired jobs cannot be removed"):
+def remove_expired(
+    jobs: JobEngine, blobs: BlobStore, strays: Strays, lifetime_s: float, log: Log, check: Check = unchecked
+) -> None:
+    """Forget jobs that ended so long ago, with their files, and files that belong to no job.
+
+    Args:
+        jobs: those that may have ended.
+        blobs: where their files are.
+        strays: finds files that belong to no job.
+        lifetime_s: how long a job is kept after its end.
+        log: where it is told that something cannot be removed.
+        check: passed before each piece of files; when it raises `Cancelled`, the rest is left for a later time.
+    """
+    with going_on(log, "expired jobs cannot be removed"), suppress(Cancelled):
         for identifier in jobs.ended_before(datetime.now(UTC) - timedelta(seconds=lifetime_s)):
-            JobFiles(blobs, identifier).remove()
+            JobFiles(blobs, identifier).remove(check)
             jobs.forget(identifier)
-    with going_on(log, "files without a job cannot be removed"):
-        strays.sweep()
+    with going_on(log, "files without a job cannot be removed"), suppress(Cancelled):
+        strays.sweep(check)
 
 
 def start_worker(slot: int) -> subprocess.Popen[bytes]:

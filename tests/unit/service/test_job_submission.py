@@ -46,7 +46,7 @@ class AwayBlobs(FolderBlobs):
     def put_file(self, key, file):  # noqa: ARG002
         raise OSError("The object storage does not answer.")
 
-    def delete(self, prefix):  # noqa: ARG002
+    def delete(self, prefix, check=None):  # noqa: ARG002
         raise OSError("The object storage does not answer.")
 
 

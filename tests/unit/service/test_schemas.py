@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from model.errors import InvalidParameter
 from model.inference.observations import Plane
-from service.request_schemas import parse_annotated, parse_labels
+from service.request_schemas import MOST_PLANES, parse_annotated, parse_labels
 
 planes = st.lists(
     st.builds(Plane, st.integers(0, 9), st.integers(0, 2), st.integers(0, 10_000)), min_size=1, max_size=5
@@ -61,6 +61,14 @@ def test_any_other_text_is_refused_in_a_sentence(text):
 def test_what_is_no_list_of_planes_is_refused(text):
     with pytest.raises(InvalidParameter):
         parse_annotated(text)
+
+
+def test_more_different_planes_than_masks_have_are_refused_and_repeated_ones_count_once():
+    text = [{"axis": 2, "index": index} for index in range(MOST_PLANES)]
+    assert len(set(parse_annotated(json.dumps(text * 2)))) == MOST_PLANES
+    with pytest.raises(InvalidParameter, match=f"{MOST_PLANES + 1} different planes; at most {MOST_PLANES}") as caught:
+        parse_annotated(json.dumps([*text, {"axis": 1, "index": 0}]))
+    assert caught.value.part == "annotated"
 
 
 @given(st.frozensets(st.integers(1, 2**31 - 1), min_size=1, max_size=6), st.booleans())
