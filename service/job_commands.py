@@ -1,9 +1,12 @@
 """The commands ``jobs ...``: long work from the command line, by the same engine and with the same progress."""
 
+import os
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from pathlib import Path
+from subprocess import Popen
 from tempfile import TemporaryFile
 from typing import Annotated, Any, BinaryIO
 
@@ -25,7 +28,7 @@ from service.job_ports import BlobStore, JobEngine, JobState, JobStatus
 from service.job_presentation import job_summary
 from service.job_results import write_zip
 from service.job_submission import JobDesk, require_archive
-from service.jobs.worker import supervised_workers
+from service.jobs.worker import start_worker, supervised_workers
 from service.model_registry import pinned_name
 from service.observability import make_log
 from service.ports import RECONSTRUCTIONS_JOB, SAMPLES_JOB, MeshFormat, SampleFormat
@@ -35,6 +38,8 @@ from service.stores import open_blobs, open_jobs, require_jobs, require_places
 
 #: How often (s) a job is looked at.
 _POLL_S = 0.5
+#: Slots of one command's own workers, at most; with its number among processes before them, they are nobody else's.
+_OWN_SLOTS = 1000
 
 OutputOption = Annotated[Path | None, typer.Option(help="ZIP to write; waits for the job. Left out: only begins it.")]
 ResultOption = Annotated[Path | None, typer.Option(help="ZIP to write once the job is done.")]
@@ -133,7 +138,10 @@ def watch_job(identifier: IdArgument, output: ResultOption = None, force: ForceO
     settings = load_settings()
     require_jobs(settings)
     with closing(open_jobs(settings)) as jobs:
-        _finish(jobs, open_blobs(settings), jobs.status(identifier), output, as_json=False)
+        status = jobs.status(identifier)
+        if output is not None:
+            _require_zip(status.kind)
+        _finish(jobs, open_blobs(settings), status, output, as_json=False)
 
 
 def cancel_job(identifier: IdArgument, as_json: JsonOption = False) -> None:
@@ -156,20 +164,58 @@ def _begin(settings: Settings, job: Job, model: str, key: str | None, output: Pa
         if output is None:
             _tell(status, as_json=as_json)
             return
-        with _someone_works(settings, jobs.workers(settings.job_lease_s)):
-            _finish(jobs, blobs, status, output, as_json=as_json)
+        with _own_workers(max(1, settings.job_workers)) as begin:
+            look = partial(_require_workers, lambda: jobs.workers(settings.job_lease_s), begin)
+            _finish(jobs, blobs, status, output, as_json=as_json, look=look)
 
 
 @contextmanager
-def _someone_works(settings: Settings, alive: int) -> Iterator[None]:
-    """Workers of this command's own when no service runs that would do the job."""
-    with supervised_workers(0 if alive else max(1, settings.job_workers), make_log("error")):
-        yield
+def _own_workers(count: int) -> Iterator[Callable[[], None]]:
+    """What starts so many workers of this command's own, which end with the context; once they run it does nothing."""
+    with ExitStack() as own:
+        begun: list[object] = []
+
+        def begin() -> None:
+            if not begun:
+                begun.append(own.enter_context(supervised_workers(count, make_log("error"), _start_own)))
+
+        yield begin
 
 
-def _finish(jobs: JobEngine, blobs: BlobStore, status: JobStatus, output: Path | None, *, as_json: bool) -> None:
+def _start_own(number: int) -> "Popen[bytes]":
+    """A worker under a name of this command's own: one that is about to leave may still hold that of its slot."""
+    return start_worker(os.getpid() * _OWN_SLOTS + number)
+
+
+def _require_workers(alive: Callable[[], int], begin: Callable[[], None]) -> None:
+    """Begin own workers when nobody works, or nobody works any more."""
+    if not alive():
+        begin()
+
+
+def _require_zip(kind: str) -> None:
+    """Refuse to wait for a ZIP that a job will not make."""
+    if kind not in (SAMPLES_JOB, RECONSTRUCTIONS_JOB):
+        raise InvalidParameter(
+            f"--output accepts a job of kind {SAMPLES_JOB} or {RECONSTRUCTIONS_JOB}, which makes a ZIP; "
+            f"leave it out for this one of kind {kind}.",
+            part="--output",
+        )
+
+
+def _finish(
+    jobs: JobEngine,
+    blobs: BlobStore,
+    status: JobStatus,
+    output: Path | None,
+    *,
+    as_json: bool,
+    look: Callable[[], None] = lambda: None,
+) -> None:
+    """Wait for a job's end, with a look at its workers each time, and write what it has made."""
     with bar() as advance:
         while not status.state.is_final:
+            look()
             time.sleep(_POLL_S)
             status = jobs.status(status.id)
             advance(status.kind, status.done, status.total)

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -14,8 +15,11 @@ import httpx
 import pytest
 
 from benchmarks.ports import free_port
+from service.adapters.jobs.client import DbosJobs
+from service.adapters.jobs.database import Leases
 from tests.job_parts import ended
 from tests.service_parts import mask_bytes
+from tests.waiting import until
 
 PROGRAM = """
 import sys
@@ -91,6 +95,36 @@ def test_a_job_outlives_its_worker_and_its_service(environment):
     with serving(environment) as (client, _):
         summary = ended(client, place)
         assert (summary["state"], summary["done"]) == ("done", 60)
+
+
+@pytest.mark.slow
+def test_a_command_does_its_job_itself_once_the_last_worker_is_gone(environment, tmp_path):
+    file, shapes = tmp_path / "state" / "jobs.sqlite", tmp_path / "shapes.zip"
+    jobs = DbosJobs(f"sqlite:///{file}")
+    assert jobs.unfinished() == 0
+    leases = Leases(f"sqlite:///{file}")
+    leases.renew("gone-0")  # as a worker does, which dies once the command has seen it
+    words = ("jobs", "sample", "--count", "5", "--output", str(shapes))
+    with subprocess.Popen([sys.executable, "-c", PROGRAM, *words], env=environment) as command:
+        try:
+            while not jobs.unfinished() and command.poll() is None:
+                leases.renew("gone-0")
+                time.sleep(0.1)
+            time.sleep(1.0)
+            assert jobs.workers(10.0) == 1
+            leases.lapse("gone-0")
+            until(lambda: command.poll() is not None)
+        finally:
+            command.kill()
+    assert command.returncode == 0
+    with zipfile.ZipFile(shapes) as archive:
+        assert len(archive.namelist()) == 6
+    with sqlite3.connect(file) as connection:
+        names = [name for (name,) in connection.execute("SELECT executor FROM morphoflow_leases")]
+    connection.close()
+    assert [name.rpartition("-")[2] for name in names] == [f"{command.pid}000"]  # no slot that another may still hold
+    leases.close()
+    jobs.close()
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ class Busy:
 
     def __init__(self) -> None:
         self._count = 0
+        self._taken = False
         self._changed = threading.Condition()
         self._ending = threading.Event()
 
@@ -39,6 +40,22 @@ class Busy:
                 self._count -= 1
                 self._changed.notify_all()
 
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """As `one`, for one at a time: the others wait for their turn, unless the worker ends."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._taken or self._ending.is_set())
+            if self._ending.is_set():
+                raise Ending
+            self._taken = True
+        try:
+            with self.one():
+                yield
+        finally:
+            with self._changed:
+                self._taken = False
+                self._changed.notify_all()
+
     def pause(self, seconds: float) -> None:
         """Let time pass, unless the worker ends."""
         if self._ending.wait(seconds):
@@ -48,4 +65,5 @@ class Busy:
         """Begin nothing more, and wait for what runs, but no longer than so."""
         with self._changed:
             self._ending.set()
+            self._changed.notify_all()
             self._changed.wait_for(lambda: self._count == 0, limit_s)

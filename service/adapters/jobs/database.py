@@ -24,8 +24,11 @@ APPLICATION = "morphoflow"
 #: Of the records, not of the program: releases with the same one take over each other's jobs.
 RECORDS_VERSION = "jobs-1"
 #: Jobs wait in the first; those that spend their time waiting for archives in the second, so that an archive that is
-#: away holds up no other job; the parts that jobs are made of in the third.
-JOBS_QUEUE, PATIENT_QUEUE, PARTS_QUEUE = "jobs", "patient", "parts"
+#: away holds up no other job; the parts that jobs are made of in the third, and those of drawings in the fourth, from
+#: which only workers take that know archives.
+JOBS_QUEUE, PATIENT_QUEUE, PARTS_QUEUE, DRAWING_PARTS_QUEUE = "jobs", "patient", "parts", "parts of drawings"
+#: Queues that are counted with another one.
+_BRANCHES = {PARTS_QUEUE: (DRAWING_PARTS_QUEUE,)}
 #: Names of the two workflows.
 JOB, PART = "job", "part"
 #: Schema of DBOS's tables on PostgreSQL.
@@ -61,6 +64,11 @@ _NOW_MS = {
 def queue_of(kind: str) -> str:
     """Where jobs of a kind wait."""
     return PATIENT_QUEUE if kind == DRAWING_JOB else JOBS_QUEUE
+
+
+def parts_queue_of(kind: str) -> str:
+    """Where parts of jobs of a kind wait."""
+    return DRAWING_PARTS_QUEUE if kind == DRAWING_JOB else PARTS_QUEUE
 
 
 def json_serializer() -> DBOSPortableJSONSerializer:
@@ -195,11 +203,12 @@ class Leases:
             connection.execute(sa.delete(_LEASES).where(_LEASES.c.executor == executor))
 
     def count(self, queue: str, *states: str) -> int:
-        """Workflows of a queue in one of the states."""
+        """Workflows of a queue, and of those that branch off it, in one of the states."""
         schema = None if self._engine.dialect.name == "sqlite" else SCHEMA
         table = sa.table("workflow_status", sa.column("queue_name"), sa.column("status"), schema=schema)
         query = sa.select(sa.func.count()).select_from(table)
-        query = query.where(table.c.queue_name == queue, table.c.status.in_(states))
+        queues = (queue, *_BRANCHES.get(queue, ()))
+        query = query.where(table.c.queue_name.in_(queues), table.c.status.in_(states))
         with self._engine.connect() as connection:
             return int(connection.execute(query).scalar_one())
 

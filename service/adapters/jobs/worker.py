@@ -1,4 +1,4 @@
-"""One worker of jobs: takes parts from the queue, one at a time, and follows jobs from checkpoint to checkpoint.
+"""One worker of jobs: does parts of the kinds it has, one at a time, and follows jobs from checkpoint to checkpoint.
 
 DBOS holds one application in a process, so a process is one worker. Its name (executor) is stable: what it held when it
 was killed it takes up again when it comes back; when it does not, another worker does.
@@ -21,6 +21,7 @@ from service.adapters.jobs.busy import Busy
 from service.adapters.jobs.client import PROGRESS, DbosJobs
 from service.adapters.jobs.database import (
     APPLICATION,
+    DRAWING_PARTS_QUEUE,
     JOB,
     JOBS_QUEUE,
     PART,
@@ -31,6 +32,7 @@ from service.adapters.jobs.database import (
     Leases,
     bounded,
     json_serializer,
+    parts_queue_of,
     prepare,
     queue_of,
 )
@@ -92,14 +94,14 @@ def running_worker(kinds: Sequence[JobKind], options: WorkerOptions, log: Log | 
     }
     dbos, busy = DBOS(config=config), Busy()
     _register({kind.name: kind for kind in kinds}, jobs, busy, log or make_log("error"))
-    queues = {queue_of(kind.name) for kind in kinds}
-    DBOS.listen_queues([*queues, PARTS_QUEUE])
+    DBOS.listen_queues(sorted({queue for kind in kinds for queue in (queue_of(kind.name), parts_queue_of(kind.name))}))
     leases, stop = Leases(options.url), threading.Event()
     leases.renew(options.executor)
     DBOS.launch()
     DBOS.register_queue(JOBS_QUEUE, worker_concurrency=JOBS_FOLLOWED, polling_interval_sec=JOBS_POLL_S)
     DBOS.register_queue(PATIENT_QUEUE, worker_concurrency=PATIENT_FOLLOWED, polling_interval_sec=JOBS_POLL_S)
-    DBOS.register_queue(PARTS_QUEUE, worker_concurrency=1, polling_interval_sec=PARTS_POLL_S)
+    for queue in (PARTS_QUEUE, DRAWING_PARTS_QUEUE):
+        DBOS.register_queue(queue, worker_concurrency=1, polling_interval_sec=PARTS_POLL_S)
     keeper = threading.Thread(target=_keep_lease, args=(leases, options, stop), name="lease", daemon=True)
     keeper.start()
     try:
@@ -122,7 +124,7 @@ def _register(kinds: Mapping[str, JobKind], jobs: DbosJobs, busy: Busy, log: Log
     def part(job: str, kind: str, name: str, item: dict[str, Any]) -> dict[str, Any]:
         check = _rarely(lambda: _require_wanted(jobs, job))
         check()
-        with busy.one(), _told(log, job, name):
+        with busy.alone(), _told(log, job, name):
             try:
                 return dict(DBOS.run_step(_tried_again(name), kinds[kind].parts[name], item, check))
             finally:
@@ -225,7 +227,8 @@ class _Run:
 
     def _begin(self, name: str, number: int, item: Record) -> Any:
         with SetWorkflowID(f"{self._id}/{name}/{number}"), SetEnqueueOptions(priority=number + 1):
-            return DBOS.enqueue_workflow(PARTS_QUEUE, self._part, self._id, self._kind, name, dict(item))
+            queue = parts_queue_of(self._kind)
+            return DBOS.enqueue_workflow(queue, self._part, self._id, self._kind, name, dict(item))
 
     def _await_end(self, part: str) -> None:
         """Until a part has ended, wherever it is done."""

@@ -1,11 +1,17 @@
 """Where commands keep results and jobs: what they refuse before any work, and what they never make."""
 
+import subprocess
+import sys
+
 import psycopg
 import pytest
 
 from benchmarks.ports import free_port
+from service.adapters.jobs.client import DbosJobs
 from service.cli import BAD_INPUT, main
 from service.model_registry import ModelRegistry
+from service.pacs_ports import DRAWING_JOB
+from service.ports import RECONSTRUCTION_JOB
 from service.stores import missing_database
 from tests.analytic_model import ellipsoid_model
 from tests.service_parts import NAME
@@ -83,3 +89,34 @@ def test_who_asks_for_a_job_in_what_is_no_database_is_told_so(words, tmp_path, c
 
 def test_a_server_that_does_not_answer_is_not_one_without_the_database():
     assert missing_database(f"postgresql://user@127.0.0.1:{free_port()}/jobs") is None
+
+
+DONE_AT_ONCE = """
+import sys, time
+from service.adapters.jobs.client import DbosJobs
+from service.adapters.jobs.worker import WorkerOptions, running_worker
+from service.job_ports import JobKind
+url, kind, identifier = sys.argv[1:]
+jobs = DbosJobs(url)
+with running_worker([JobKind(kind, lambda run, _: {kind: run.id}, {})], WorkerOptions(url, "a-0")):
+    while not jobs.status(identifier).state.is_final:
+        time.sleep(0.1)
+jobs.close()
+"""
+
+
+@pytest.mark.parametrize("kind", [RECONSTRUCTION_JOB, DRAWING_JOB])
+def test_a_job_that_makes_no_zip_is_followed_and_fills_no_file(kind, url, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("MORPHOFLOW_RESULTS_FOLDER", str(tmp_path / "state" / "results"))
+    monkeypatch.setenv("MORPHOFLOW_JOBS_DATABASE", url)
+    jobs, target = DbosJobs(url), tmp_path / "all.zip"
+    identifier = jobs.new_id(kind)
+    jobs.enqueue(kind, {}, identifier)
+    output = ("--output", str(target))
+    jobs.close()
+    subprocess.run([sys.executable, "-c", DONE_AT_ONCE, url, kind, identifier], check=True, timeout=60.0)
+    assert run("jobs", "watch", identifier, *output) == BAD_INPUT
+    (told,) = capsys.readouterr().err.splitlines()
+    assert "--output accepts a job of kind samples or reconstructions" in told
+    assert not target.exists()
+    assert run("jobs", "watch", identifier) == 0

@@ -2,6 +2,7 @@
 
 import io
 import json
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -16,13 +17,16 @@ from sqlalchemy.exc import ProgrammingError
 
 from benchmarks.ports import free_port
 from model.errors import InvalidMask
+from service.adapters.jobs.busy import Busy, Ending
 from service.adapters.jobs.client import DbosJobs
-from service.adapters.jobs.database import Leases, bounded, is_made
+from service.adapters.jobs.database import DRAWING_PARTS_QUEUE, PARTS_QUEUE, Leases, bounded, is_made
 from service.adapters.jobs.worker import WorkerOptions, running_worker
 from service.errors import KINDS, Overloaded, StoreFull, UnknownJob
 from service.job_ports import JobKind, JobState, JobStatus
 from service.observability import make_log
+from service.pacs_ports import DRAWING_JOB
 from tests.small_disks import fill, small_disk
+from tests.waiting import until
 
 
 def squares(seen: list[int], fail: tuple[int, ...] = (), fault: Exception | None = None) -> JobKind:
@@ -176,6 +180,92 @@ def follow(run, argument):
 with running_worker([JobKind("squares", follow, {"square": square})], WorkerOptions(sys.argv[1], sys.argv[3], 2.0)):
     time.sleep(120)
 """
+
+
+def slow_kind(name, seen, seconds=0.05):
+    """Parts of which each takes a while, and tells when it began and ended."""
+
+    def follow(run, argument):
+        run.expect(argument["count"])
+        return {"all": len(run.spread("part", [{"x": x} for x in range(argument["count"])]))}
+
+    def part(item, _check):
+        seen.append((name, item["x"], "begun"))
+        time.sleep(seconds)
+        seen.append((name, item["x"], "ended"))
+        return {}
+
+    return JobKind(name, follow, {"part": part})
+
+
+def test_a_worker_takes_no_parts_of_kinds_that_it_lacks(url, tmp_path):
+    jobs, leases, seen = DbosJobs(url), Leases(url), []
+    identifier = jobs.new_id(DRAWING_JOB)
+    assert jobs.workers(60.0) == 0
+    with subprocess.Popen([sys.executable, "-c", KILLED_WORKER, url, str(tmp_path), "without-0"]) as without:
+        try:
+            until(lambda: leases.alive(60.0) == 1)
+            other = jobs.new_id("squares")
+            jobs.enqueue("squares", {"count": 1}, other)
+            assert awaited(jobs, other).state is JobState.DONE  # it takes what it has
+            with running_worker([slow_kind(DRAWING_JOB, seen, 0.2)], WorkerOptions(url, "with-0")):
+                jobs.enqueue(DRAWING_JOB, {"count": 12}, identifier)
+                status = awaited(jobs, identifier)
+        finally:
+            without.kill()
+    assert (status.state, status.result, status.problem) == (JobState.DONE, {"all": 12}, None)
+    leases.close()
+    jobs.close()
+
+
+def test_parts_of_all_kinds_are_done_one_at_a_time(sqlite_url):
+    jobs, seen, names = DbosJobs(sqlite_url), [], (DRAWING_JOB, "others")
+    identifiers = [jobs.new_id(name) for name in names]
+    for name, identifier in zip(names, identifiers, strict=True):
+        jobs.enqueue(name, {"count": 8}, identifier)
+    with running_worker([slow_kind(name, seen) for name in names], WorkerOptions(sqlite_url, "a-0")):
+        assert {awaited(jobs, identifier).state for identifier in identifiers} == {JobState.DONE}
+    assert [step for *_, step in seen] == ["begun", "ended"] * 16
+    assert [part for *part, _ in seen[::2]] == [part for *part, _ in seen[1::2]]
+    jobs.close()
+
+
+def test_who_waits_for_a_turn_when_the_worker_ends_never_has_it():
+    busy, told = Busy(), []
+
+    def wait():
+        try:
+            with busy.alone():
+                told.append("had it")
+        except Ending:
+            told.append("ended")
+
+    with busy.alone():
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        busy.end(0.0)
+        waiting.join(10.0)
+    assert told == ["ended"]
+
+
+def test_parts_of_drawings_in_the_queue_of_all_parts_are_done_all_the_same(sqlite_url):
+    jobs, seen = DbosJobs(sqlite_url), []
+    identifier = jobs.new_id(DRAWING_JOB)
+    jobs.enqueue(DRAWING_JOB, {"count": 20}, identifier)
+    kinds = [slow_kind(DRAWING_JOB, seen), squares([])]
+    with running_worker(kinds, WorkerOptions(sqlite_url, "a-0")):
+        awaited(jobs, identifier, lambda status: status.done > 1)
+    waiting = jobs.backlog()
+    with sqlite3.connect(make_url(sqlite_url).database) as connection:
+        moved = connection.execute(
+            "UPDATE workflow_status SET queue_name = ? WHERE queue_name = ? AND status = 'ENQUEUED'",
+            (PARTS_QUEUE, DRAWING_PARTS_QUEUE),
+        )
+    connection.close()
+    assert moved.rowcount == waiting > 0
+    with running_worker(kinds, WorkerOptions(sqlite_url, "b-0")):
+        assert awaited(jobs, identifier).state is JobState.DONE
+    jobs.close()
 
 
 @pytest.mark.parametrize("heir", ["gone-0", "other-0"], ids=["it comes back", "another takes over"])
