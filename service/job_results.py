@@ -15,6 +15,8 @@ from service.ports import SAMPLES_JOB
 MANIFEST = "manifest.json"
 #: What is said of a job whose result was deleted or has expired before it.
 RESULT_GONE = "The job's result has expired or been deleted."
+#: What is said of a job of a drawing.
+GIVEN_BACK = "The job's results were given back to archives; they are not kept here."
 
 
 def result_members(job: JobFiles, kind: str, count: int) -> Iterator[tuple[str, bytes]]:

@@ -16,10 +16,10 @@ from service.errors import KINDS, Cancelled, NotReady, Overloaded, UnknownJob, U
 from service.job_files import JobFiles, remove_job
 from service.job_ports import JobState, JobStatus
 from service.job_presentation import job_summary
-from service.job_results import MANIFEST, RESULT_GONE, result_members
+from service.job_results import GIVEN_BACK, MANIFEST, RESULT_GONE, result_members
 from service.job_schemas import JobForm, JobSummary
 from service.job_submission import require_archive
-from service.ports import RECONSTRUCTION_JOB, SAMPLES_JOB
+from service.ports import RECONSTRUCTION_JOB, RECONSTRUCTIONS_JOB, SAMPLES_JOB
 from service.request_schemas import parse_annotated
 from service.routes.dependencies import Services, WithServices, address
 from service.routes.job_requests import (
@@ -172,6 +172,8 @@ async def read_result(identifier: Identifier, request: Request, services: WithSe
         raise NotReady(f"The job has no result: its state is {status.state.value}.{why}", status.problem_kind)
     if status.kind == RECONSTRUCTION_JOB:
         return RedirectResponse(address(request, f"/v1/reconstructions/{identifier}"), 303)
+    if status.kind not in (SAMPLES_JOB, RECONSTRUCTIONS_JOB):
+        raise UnknownResult(GIVEN_BACK)
     members = result_members(JobFiles(services.blobs, identifier), status.kind, status.result["count"])
     first = await services.turns.run(next, members)  # what is gone, or cannot be read, is told before anything is sent
     return StreamingResponse(_zip(chain([first], members)), media_type=ZIP, headers=attachment(f"{status.kind}.zip"))
