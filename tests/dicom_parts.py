@@ -184,6 +184,13 @@ def ring(images, number: int, radii: tuple[float, ...]):
     return [middle + radius * (corners @ np.stack([row, column])) for radius in radii]
 
 
+def two_boxes(size: tuple[int, int, int]) -> np.ndarray:
+    """Two structures beside each other (column, row, plane, segment)."""
+    both = np.zeros((*size, 2), np.uint8)
+    both[3:6, 3:6, 3:6, 0] = both[7:9, 3:6, 3:6, 1] = 1
+    return both
+
+
 def file_bytes(found: Dataset) -> bytes:
     """The object as a DICOM file with its preamble."""
     buffer = io.BytesIO()

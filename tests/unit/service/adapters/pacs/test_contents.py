@@ -10,7 +10,7 @@ from pydicom.uid import RLELossless
 from service.adapters.dicom.masks import stacks_of_object
 from service.adapters.image_guard import ImageLimits
 from service.adapters.pacs.contents import content_digest
-from tests.dicom_parts import grid_of, mr_series, reread, ring, rtstruct_of, seg_of
+from tests.dicom_parts import grid_of, mr_series, reread, ring, rtstruct_of, seg_of, two_boxes
 
 SIZE = (12, 10, 8)
 LIMITS = ImageLimits(max_bytes=1 << 20, max_voxels=1 << 20)
@@ -23,9 +23,7 @@ def images():
 
 @pytest.fixture(scope="module")
 def drawing(images):
-    both = np.zeros((*SIZE, 2), np.uint8)
-    both[3:6, 3:6, 3:6, 0] = both[7:9, 3:6, 3:6, 1] = 1
-    return reread(seg_of(images, both, "LABELMAP", labels=("left", "right")))
+    return reread(seg_of(images, two_boxes(SIZE), "LABELMAP", labels=("left", "right")))
 
 
 def segment_of(found, number):

@@ -9,7 +9,7 @@ from model.errors import InvalidMask, InvalidParameter
 from service.adapters.dicom.masks import referenced_series
 from service.adapters.pacs.configuration import Rule, load_configuration
 from service.adapters.pacs.routing import MOST_STRUCTURES, find_rule
-from tests.dicom_parts import mr_series, reread, ring, rtstruct_of, seg_of, with_region
+from tests.dicom_parts import mr_series, reread, ring, rtstruct_of, seg_of, two_boxes, with_region
 
 SIZE = (12, 10, 8)
 
@@ -21,9 +21,7 @@ def images():
 
 @pytest.fixture(scope="module")
 def drawing(images):
-    both = np.zeros((*SIZE, 2), np.uint8)
-    both[3:6, 3:6, 3:6, 0] = both[7:9, 3:6, 3:6, 1] = 1
-    return reread(seg_of(images, both, labels=("Left hippocampus", "tumour")))
+    return reread(seg_of(images, two_boxes(SIZE), labels=("Left hippocampus", "tumour")))
 
 
 def rule(**conditions) -> Rule:
