@@ -12,16 +12,11 @@ from jaxtyping import Float
 
 from model.inference.mesh import Mesh, empty_mesh, is_watertight, largest_component, mesh_of, unit
 from model.inference.polygons import INTERIOR, Polygons, checkered_nodes, polygons_of
-from model.inference.refinement import Refinement
+from model.inference.refinement import Field, Refinement, coarse_factor_of, completed
 
-#: Positive inside, negative outside; points in mm.
-Field = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
 #: Values and their gradient (per mm).
 FieldWithGradient = Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]]
 
-#: The coarsest grid has at least this many cells along each axis.
-COARSE_CELLS = 5
-FACTORS = (2, 4, 8, 16, 32)
 #: Value of a node whose sign had to change.
 RAISED = 1e-30
 #: Vertices keep this share of an edge away from its ends.
@@ -66,7 +61,7 @@ def extract_surface(
     Raises:
         InvalidParameter: a step, box or factor that no grid can have.
     """
-    factor = coarse_factor or _coarse_factor(lower, upper, step_mm)
+    factor = coarse_factor or coarse_factor_of(lower, upper, step_mm)
     refinement = Refinement(lower, upper, step_mm, factor, steepest)
     polygons = _polygons(refinement, field)
     if polygons is None:
@@ -79,8 +74,7 @@ def extract_surface(
 
 def _polygons(refinement: Refinement, field: Field) -> Polygons | None:
     """Polygons of the finest grid, its values changed where they would not be two-manifold; None where it is empty."""
-    _complete(refinement, field)
-    cells, values = refinement.crossed()
+    cells, values = completed(refinement, field).crossed()
     if not len(cells):
         return None
     polygons = polygons_of(cells, values)
@@ -88,14 +82,8 @@ def _polygons(refinement: Refinement, field: Field) -> Polygons | None:
         return polygons
     while len(nodes := checkered_nodes(cells, values)):
         refinement.raise_nodes(nodes, RAISED)
-        _complete(refinement, field)
-        cells, values = refinement.crossed()
+        cells, values = completed(refinement, field).crossed()
     return polygons_of(cells, values)
-
-
-def _complete(refinement: Refinement, field: Field) -> None:
-    while len(points := refinement.query()):
-        refinement.update(field(points))
 
 
 def _settled(
@@ -160,9 +148,3 @@ def edge_zeros(
         following = zero - np.divide(value, tilt, out=np.full_like(zero, np.inf), where=tilt != 0)
         zero = np.where((following >= low) & (following <= high), following, (low + high) / 2.0)
     return np.asarray(np.clip(zero, EDGE_MARGIN, 1.0 - EDGE_MARGIN))
-
-
-def _coarse_factor(lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], step_mm: float) -> int:
-    """The largest power of two that leaves `COARSE_CELLS` cells along the shortest axis of the box."""
-    cells = float(np.min(np.asarray(upper) - lower)) / step_mm if step_mm > 0 else 0.0
-    return max((factor for factor in FACTORS if cells >= COARSE_CELLS * factor), default=1)

@@ -66,6 +66,11 @@ class SparseLattice:
         """All cells in use."""
         return self._nodes(np.flatnonzero(self._cells))
 
+    def known(self) -> tuple[Nodes, Float[np.ndarray, "_"]]:
+        """All nodes that have values, and these."""
+        address = np.flatnonzero(~np.isnan(self._values))
+        return self._nodes(address), self._values[address]
+
     def unknown_corners(self, cells: Nodes) -> Nodes:
         """Corners of cells that have no value yet, each once."""
         address = self._reserved(cells, _PAIR)

@@ -17,6 +17,7 @@ from model.geometry import Grid
 from model.inference.mesh import Mesh
 from model.inference.observations import Observations
 from model.inference.uncertainty import ShapeState, occupancy
+from model.inference.voxels import inside_mask
 
 #: A voxel belongs to the object from this probability on.
 OCCUPIED = 0.5
@@ -37,7 +38,12 @@ def body_probability(model: ShapeModel, state: ShapeState, mesh: Mesh, grid: Gri
 
 def body_mask(model: ShapeModel, state: ShapeState, mesh: Mesh, grid: Grid) -> Bool[np.ndarray, "i j k"]:
     """The voxels of a grid that more likely than not belong to the surface's body."""
-    return body_probability(model, state, mesh, grid) >= OCCUPIED
+    if state.members:
+        return body_probability(model, state, mesh, grid) >= OCCUPIED
+    # However wide it is, the posterior of a fit leaves the more probable label to the fit's own field.
+    inside = inside_mask(model, state.fits[0], grid)
+    bodies, others = _bodies(inside, grid, mesh)
+    return inside & ~np.isin(bodies, others) if len(others) else inside
 
 
 def of_one_body(probability: Float[np.ndarray, "i j k"], grid: Grid, mesh: Mesh) -> Float[np.ndarray, "i j k"]:
@@ -47,8 +53,7 @@ def of_one_body(probability: Float[np.ndarray, "i j k"], grid: Grid, mesh: Mesh)
         probability: of each voxel of the grid.
         mesh: the surface (world mm).
     """
-    bodies, count = label(probability >= OCCUPIED, np.ones((3, 3, 3), int))
-    others = _beyond(bodies, count, grid, mesh) if count > 1 else ()
+    bodies, others = _bodies(probability >= OCCUPIED, grid, mesh)
     if not len(others):
         return probability
     nearest = np.asarray(distance_transform_edt(bodies == 0, grid.spacing, return_distances=False, return_indices=True))
@@ -72,6 +77,14 @@ def separate_warnings(observations: Observations, logits: Float[np.ndarray, "n"]
         "shows several, send each by itself (label chooses it)."
     )
     return (sentence,)
+
+
+def _bodies(
+    inside: Bool[np.ndarray, "i j k"], grid: Grid, mesh: Mesh
+) -> tuple[Int[np.ndarray, "i j k"], Sequence[int]]:
+    """The number of each voxel's body, 0 outside all, and the numbers of those that the surface does not enclose."""
+    bodies, count = label(inside, np.ones((3, 3, 3), int))
+    return bodies, _beyond(bodies, count, grid, mesh) if count > 1 else ()
 
 
 def _outside_mm(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.ndarray, "n"]:

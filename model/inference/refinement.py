@@ -22,12 +22,20 @@ thinner than a coarse cell and connected to nothing, or parts that repeat at the
 connected is followed, whatever its slopes.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from model.errors import InvalidParameter
 from model.inference.lattice import CORNERS, Nodes, SparseLattice, corners_of
 
+#: Positive inside, negative outside; points in mm.
+Field = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
+
+#: The coarsest grid has at least this many cells along each axis.
+COARSE_CELLS = 5
+FACTORS = (2, 4, 8, 16, 32)
 #: Share of the interpolation error's bound by second differences that a ridge between two nodes can reach.
 KINK = 4.0
 #: Weights of a cell's corners in the corners of its eighths: (eighth, corner of the eighth, corner).
@@ -107,6 +115,10 @@ class Refinement:
         outer = self._outer(cells)
         mixed = _mixed(values)
         return np.concatenate([cells[mixed], outer]), np.concatenate([values[:, mixed].T, self._padded(outer)])
+
+    def known(self) -> tuple[Nodes, Float[np.ndarray, "n"]]:
+        """Nodes of the finest grid that have values: all around cells through which the surface may run."""
+        return self._lattice.known()
 
     def beyond_ends(self, starts: Nodes, axes: Int[np.ndarray, "v"]) -> Float[np.ndarray, "v 2"]:
         """Values at the nodes of the finest grid before and behind edges on their own lines; NaN where unknown.
@@ -216,6 +228,19 @@ class Refinement:
         values = self._lattice.values(np.clip(nodes, 0, self._cells))
         outside = np.any((nodes < 0) | (nodes > self._cells), axis=1)
         return np.where(outside, -np.abs(values), values).reshape(-1, 8)
+
+
+def completed(refinement: Refinement, field: Field) -> Refinement:
+    """The refinement with all values that it asks for."""
+    while len(points := refinement.query()):
+        refinement.update(field(points))
+    return refinement
+
+
+def coarse_factor_of(lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], step_mm: float) -> int:
+    """The largest power of two that leaves `COARSE_CELLS` cells along the shortest axis of a box."""
+    cells = float(np.min(np.asarray(upper) - lower)) / step_mm if step_mm > 0 else 0.0
+    return max((factor for factor in FACTORS if cells >= COARSE_CELLS * factor), default=1)
 
 
 def _signs(values: Float[np.ndarray, "8 n"]) -> UInt8[np.ndarray, "n"]:

@@ -32,7 +32,7 @@ from model.inference.posterior import (
     open_variance,
 )
 from model.inference.spread import LocalSpread, SurfaceSpread
-from model.inference.surface import canonical_box
+from model.inference.voxels import voxels_in_box
 
 #: Beyond this logit the posterior variance cannot move a probability visibly.
 SATURATED_LOGIT = 12.0
@@ -151,7 +151,7 @@ def area_estimate(mesh: Mesh, spread: SurfaceSpread | None) -> Estimate:
 def occupancy(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndarray, "i j k"]:
     """Posterior mean occupancy probability at the voxel centres of a grid; 0 outside the model's box."""
     result = np.zeros(grid.shape, np.float32)
-    index, points = _voxels_in_box(model, state.fits[0], grid)
+    index, points = voxels_in_box(model, state.fits[0], grid)
     if len(points):
         found = (
             _member_probabilities(model, state, grid, index, points)
@@ -235,22 +235,6 @@ def _near_border(
     labels[places] = inside
     distance = np.where(labels, *(distance_transform_edt(one, spacing) for one in (labels, ~labels)))
     return np.asarray(distance[places] <= FAR_MM)
-
-
-def _voxels_in_box(
-    model: ShapeModel, found: Fit, grid: Grid
-) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Indices and world positions of the voxels that lie in the model's canonical box."""
-    half = canonical_box(model)
-    corners = half * np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    reach = grid.to_index(found.pose.to_world(corners))
-    low = np.clip(np.floor(reach.min(axis=0)), 0, grid.shape).astype(int)
-    high = np.clip(np.ceil(reach.max(axis=0)) + 1, 0, grid.shape).astype(int)
-    axes = [np.arange(a, max(a, b)) for a, b in zip(low, high, strict=True)]
-    index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = grid.to_world(index.astype(float))
-    inside: Bool[np.ndarray, "n"] = (np.abs(found.pose.to_canonical(points)) <= half).all(axis=1)
-    return index[inside], points[inside]
 
 
 def voxel_entropy(probability: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:

@@ -6,7 +6,7 @@ import pytest
 from model.geometry import Grid
 from model.inference.mesh import volume_ml
 from model.inference.observations import MaskStack
-from model.inference.one_body import OCCUPIED, of_one_body, separate_warnings
+from model.inference.one_body import OCCUPIED, body_mask, of_one_body, separate_warnings
 from model.inference.reconstruction import Options, reconstruct
 from model.inference.surface import covering_grid
 from model.inference.uncertainty import occupancy
@@ -42,6 +42,7 @@ def test_a_second_drawn_object_is_in_neither_map_nor_surface_and_is_told_of():
     body = of_one_body(whole, GRID, answer.mesh)
     assert filled_ml(whole, GRID) > 1.1 * volume_ml(answer.mesh)
     assert filled_ml(body, GRID) == pytest.approx(volume_ml(answer.mesh), rel=0.02)
+    assert np.array_equal(body_mask(MODEL, answer.state, answer.mesh, GRID), body >= OCCUPIED)
     assert any("one connected object" in warning for warning in answer.warnings)
 
 
