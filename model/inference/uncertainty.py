@@ -189,8 +189,11 @@ def settled_variance(
     Args:
         by_parameter, by_point: derivatives of the logits as `fitted_jacobians` gives them.
     """
-    by_rule = np.square(end_moves(found, by_point)).sum(axis=1)
-    return np.asarray(logit_variance(by_parameter, covariance) + by_rule)
+    return np.asarray(logit_variance(by_parameter, covariance) + _variance_by_rule(found, by_point))
+
+
+def _variance_by_rule(found: Fit, by_point: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    return np.asarray(np.square(end_moves(found, by_point)).sum(axis=1))
 
 
 def _logits(
@@ -214,12 +217,18 @@ def _member_probabilities(
 ) -> Float[np.ndarray, "n"]:
     """Mean probability over an ensemble; far from the fit's surface all members agree with it.
 
-    Members' own logits are as soft as they are: what the discrepancy leaves open is not added to them.
+    Members' own logits are as soft as they are: what the discrepancy leaves open is not added to them. By what rule
+    thick slices were drawn is as open to members as to the fit.
     """
-    inside = model_logits(model, state.fits[0], points) > 0
+    found = state.fits[0]
+    inside = model_logits(model, found, points) > 0
     near = _near_border(inside, index, grid.spacing)
-    result = inside.astype(float)
-    members = [_sigmoid(fitted_logits(model, member, points[near])) for member in state.members]
+    result, places = inside.astype(float), points[near]
+    doubt = np.zeros(len(places))
+    if found.thick_doubt is not None:
+        by_point = field_derivatives(model, found, found.pose.to_canonical(places)).by_point
+        doubt = _variance_by_rule(found, found.pose.gradient_to_world(by_point))
+    members = [mean_probability(fitted_logits(model, member, places), doubt) for member in state.members]
     result[near] = np.mean(members, axis=0)
     return result
 

@@ -225,9 +225,10 @@ def test_draws_are_as_open_as_the_interval_where_the_rule_is():
     assert narrow_ml < 0.75 * open_ml
 
 
-def test_voxels_beyond_the_ends_are_as_open_as_the_rule_is():
-    answer = reconstruct(MODEL, [thick_stack(4, 44, "half")], Options(annotated="nonempty"))
-    sure = replace(answer.state, fits=(replace(answer.state.fits[0], thick_doubt=None),))
+@pytest.mark.parametrize("uncertainty", ["laplace", "ensemble"])
+def test_voxels_beyond_the_ends_are_as_open_as_the_rule_is(uncertainty):
+    answer = reconstruct(MODEL, [thick_stack(4, 44, "half")], Options(annotated="nonempty", uncertainty=uncertainty))
+    sure = replace(answer.state, fits=(replace(answer.state.fits[0], thick_doubt=None), *answer.state.members))
     beyond = np.diag(TRUTH.semi_axes + np.array([1.0, 1.0, 1.0]))
     grid = Grid((2, 1, 1), cube_around(CENTRE).affine)
 
