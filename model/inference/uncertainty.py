@@ -8,7 +8,7 @@ the error that all contours share.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from scipy.special import expit
 
@@ -32,7 +32,7 @@ from model.inference.posterior import (
     open_variance,
 )
 from model.inference.spread import LocalSpread, SurfaceSpread
-from model.inference.voxels import voxels_in_box
+from model.inference.voxels import SLAB, inside_mask, slabs_in_box
 
 #: Beyond this logit the posterior variance cannot move a probability visibly.
 SATURATED_LOGIT = 12.0
@@ -150,15 +150,11 @@ def area_estimate(mesh: Mesh, spread: SurfaceSpread | None) -> Estimate:
 
 def occupancy(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndarray, "i j k"]:
     """Posterior mean occupancy probability at the voxel centres of a grid; 0 outside the model's box."""
+    if state.members:
+        return _mean_of_members(model, state, grid)
     result = np.zeros(grid.shape, np.float32)
-    index, points = voxels_in_box(model, state.fits[0], grid)
-    if len(points):
-        found = (
-            _member_probabilities(model, state, grid, index, points)
-            if state.members
-            else _probabilities(model, state, points)
-        )
-        result[tuple(index.T)] = found
+    for index, points in slabs_in_box(model, state.fits[0], grid):
+        result[tuple(index.T)] = _probabilities(model, state, points)
     return result
 
 
@@ -212,38 +208,52 @@ def _logits(
     return np.where(is_open, logits, by_code), is_open
 
 
+def _mean_of_members(model: ShapeModel, state: ShapeState, grid: Grid) -> Float[np.ndarray, "i j k"]:
+    """Mean probability over an ensemble; far from the fit's surface all members agree with it."""
+    found = state.fits[0]
+    inside = inside_mask(model, found, grid)
+    result, near = inside.astype(np.float32), _near_border(inside, grid.spacing)
+    for index, points in slabs_in_box(model, found, grid):
+        close = near[tuple(index.T)]
+        if close.any():
+            result[tuple(index[close].T)] = _member_probabilities(model, state, points[close])
+    return result
+
+
 def _member_probabilities(
-    model: ShapeModel, state: ShapeState, grid: Grid, index: Int[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"]
+    model: ShapeModel, state: ShapeState, points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Mean probability over an ensemble; far from the fit's surface all members agree with it.
+    """Mean probability over an ensemble at world points (mm).
 
     Members' own logits are as soft as they are: what the discrepancy leaves open is not added to them. By what rule
     thick slices were drawn is as open to members as to the fit.
     """
-    found = state.fits[0]
-    inside = model_logits(model, found, points) > 0
-    near = _near_border(inside, index, grid.spacing)
-    result, places = inside.astype(float), points[near]
-    doubt = np.zeros(len(places))
+    found, doubt = state.fits[0], np.zeros(len(points))
     if found.thick_doubt is not None:
-        by_point = field_derivatives(model, found, found.pose.to_canonical(places)).by_point
+        by_point = field_derivatives(model, found, found.pose.to_canonical(points)).by_point
         doubt = _variance_by_rule(found, found.pose.gradient_to_world(by_point))
-    members = [mean_probability(fitted_logits(model, member, places), doubt) for member in state.members]
-    result[near] = np.mean(members, axis=0)
-    return result
+    members = [mean_probability(fitted_logits(model, member, points), doubt) for member in state.members]
+    return np.asarray(np.mean(members, axis=0))
 
 
-def _near_border(
-    inside: Bool[np.ndarray, "n"], index: Int[np.ndarray, "n 3"], spacing: Float[np.ndarray, "3"]
-) -> Bool[np.ndarray, "n"]:
-    """Voxels within `FAR_MM` of others of another label; all where there is but one label."""
+def _near_border(inside: Bool[np.ndarray, "i j k"], spacing: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "i j k"]:
+    """Voxels within `FAR_MM` of others of another label; all where there is but one label.
+
+    Some layers at a time, with as many around them as may matter.
+    """
     if inside.all() or not inside.any():
-        return np.ones(len(inside), bool)
-    places = tuple((index - index.min(axis=0)).T)
-    labels = np.zeros(np.ptp(index, axis=0) + 1, bool)
-    labels[places] = inside
-    distance = np.where(labels, *(distance_transform_edt(one, spacing) for one in (labels, ~labels)))
-    return np.asarray(distance[places] <= FAR_MM)
+        return np.ones(inside.shape, bool)
+    result = np.zeros(inside.shape, bool)
+    around, layers = int(np.ceil(FAR_MM / spacing[0])), max(1, SLAB // inside[0].size)
+    for first in range(0, len(inside), layers):
+        before = max(0, first - around)
+        labels = inside[before : first + layers + around]
+        distance = np.full(labels.shape, np.inf)
+        for one in (labels, ~labels):
+            if not one.all():
+                np.copyto(distance, distance_transform_edt(one, spacing), where=one)
+        result[first : first + layers] = distance[first - before :][:layers] <= FAR_MM
+    return result
 
 
 def voxel_entropy(probability: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:

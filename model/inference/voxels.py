@@ -1,9 +1,10 @@
 """Voxels of a grid: those in the box that a model's surface is looked for in, and those inside the surface."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int8
+from jaxtyping import Bool, Float, Int
 
 from model.bundle import ShapeModel
 from model.geometry import Grid
@@ -12,18 +13,25 @@ from model.inference.posterior import fitted_logits
 from model.inference.refinement import Refinement, coarse_factor_of, completed
 from model.inference.surface import canonical_box
 
+#: Voxels whose positions are held at the same time, about.
+SLAB = 1 << 18
 #: Values at places on a grid (indices, fractions allowed), positive inside.
 IndexField = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
 
 
-def voxels_in_box(model: ShapeModel, found: Fit, grid: Grid) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Indices and world positions (mm) of the voxels that lie in the model's canonical box."""
+def slabs_in_box(
+    model: ShapeModel, found: Fit, grid: Grid
+) -> Iterator[tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]]:
+    """Indices and world positions (mm) of the voxels that lie in the model's canonical box, some layers at a time."""
     low, high = _range_of_box(model, found, grid)
-    axes = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
-    index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = grid.to_world(index.astype(float))
-    inside = _is_in_box(model, found, points)
-    return index[inside], points[inside]
+    layers = max(1, SLAB // max(1, int(np.prod(high[1:] - low[1:]))))
+    for first in range(low[0], high[0], layers):
+        axes = [np.arange(first, min(first + layers, high[0])), *(np.arange(low[k], high[k]) for k in (1, 2))]
+        index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        points = grid.to_world(index.astype(float))
+        inside = _is_in_box(model, found, points)
+        if inside.any():
+            yield index[inside], points[inside]
 
 
 def inside_mask(model: ShapeModel, found: Fit, grid: Grid) -> Bool[np.ndarray, "i j k"]:
@@ -39,8 +47,10 @@ def inside_mask(model: ShapeModel, found: Fit, grid: Grid) -> Bool[np.ndarray, "
 
     result = np.zeros(grid.shape, bool)
     if (high > low).all():
-        index = low + np.argwhere(positive_nodes(field, high - low))
-        result[tuple(index[_is_in_box(model, found, grid.to_world(index.astype(float)))].T)] = True
+        result[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = positive_nodes(field, high - low)
+        for layer in np.flatnonzero(result.any(axis=(1, 2))):
+            index = np.insert(np.argwhere(result[layer]), 0, layer, axis=1)
+            result[tuple(index.T)] = _is_in_box(model, found, grid.to_world(index.astype(float)))
     return result
 
 
@@ -64,19 +74,10 @@ def positive_nodes(field: IndexField, shape: Int[np.ndarray, "3"]) -> Bool[np.nd
     signs = np.zeros(tuple(shape), np.int8)
     signs[tuple(nodes.T)] = np.where(values > 0, 1, -1)
     for axis in (2, 1, 0):
-        signs = _carried(_carried(signs, axis)[_reversed(axis)], axis)[_reversed(axis)]
+        layers = np.moveaxis(signs, axis, 0)
+        for last, layer in (*pairwise(layers), *pairwise(layers[::-1])):
+            np.copyto(layer, last, where=layer == 0)
     return signs > 0
-
-
-def _carried(signs: Int8[np.ndarray, "i j k"], axis: int) -> Int8[np.ndarray, "i j k"]:
-    """Signs with that of the last known node before it at each unknown one."""
-    along = np.arange(signs.shape[axis]).reshape([-1 if other == axis else 1 for other in range(3)])
-    last = np.maximum.accumulate(np.where(signs != 0, along, 0), axis=axis)
-    return np.asarray(np.take_along_axis(signs, last, axis=axis))
-
-
-def _reversed(axis: int) -> tuple[slice, ...]:
-    return tuple(slice(None, None, -1 if other == axis else 1) for other in range(3))
 
 
 def _range_of_box(model: ShapeModel, found: Fit, grid: Grid) -> tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]:

@@ -352,11 +352,17 @@ def test_the_background_is_empty_and_the_core_full_though_the_contours_bound_the
     assert np.abs(values[near] - exact).max() < (0.4 if uncertain else 1e-6)
 
 
-def test_the_memory_of_a_map_does_not_grow_with_the_parameters():
-    found, nodes = held_fit(), 121
-    tracemalloc.start()
-    grid = cube_around(CENTRE, step=40.0 / nodes, nodes=nodes)
-    occupancy(MODEL, ShapeState((found,), laplace_covariance(found)), grid)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 200 * nodes**3
+@pytest.mark.parametrize("kind", ["none", "laplace", "ensemble"])
+def test_the_memory_of_a_map_is_that_of_its_voxels_and_of_some_layers(kind):
+    found = held_fit()
+    covariance = laplace_covariance(found) if kind == "laplace" else None
+    state = ShapeState((found, found, found) if kind == "ensemble" else (found,), covariance)
+
+    def peak(nodes: int) -> int:
+        tracemalloc.start()
+        occupancy(MODEL, state, cube_around(CENTRE, step=40.0 / nodes, nodes=nodes))
+        taken = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return taken
+
+    assert peak(141) - peak(101) < 30 * (141**3 - 101**3)
