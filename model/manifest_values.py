@@ -31,7 +31,7 @@ def check_values(values: Mapping[str, Any]) -> None:
         BundleCorrupt: names the first that cannot be and says what is accepted.
     """
     for name, is_right, accepted in _RULES:
-        if not is_right(values[name]):
+        if name in values and not is_right(values[name]):
             raise BundleCorrupt(f"{name} of the manifest is {_shown(values[name])}; {accepted} accepted.")
     if len(values["sigmas"]) != values["latent_size"]:
         raise BundleCorrupt(
@@ -103,6 +103,19 @@ def _are_figures(value: object) -> bool:
     return all(_is_number(figure) for group in value.values() for figure in group.values())
 
 
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_record(value: object) -> bool:
+    return isinstance(value, Mapping)
+
+
+def _is_code(value: object) -> bool:
+    names = ("value", "scheme", "meaning")
+    return value == {} or (isinstance(value, Mapping) and all(_is_text(value.get(name)) for name in names))
+
+
 def _one_of(*known: str) -> Callable[[object], bool]:
     return lambda value: value in known
 
@@ -123,5 +136,8 @@ _RULES: tuple[tuple[str, Callable[[object], bool], str], ...] = (
     ("resolution_mm", _is_positive, "a positive number is"),
     ("likelihood_precision", _is_positive, "a positive number is"),
     ("active_dimensions", _all(3, _is_count), "three whole numbers from 1 are"),
+    *((name, _is_text, "a text is") for name in ("structure", "licence", "attribution")),
+    *((name, _is_record, "an object is") for name in ("training", "calibration")),
+    ("anatomy", _is_code, "an object with value, scheme and meaning, or an empty one, is"),
     ("accuracy", _are_figures, "finite numbers by regime and name are"),
 )

@@ -27,6 +27,7 @@ from service.console import echo_json, in_order, progress, require_free, require
 from service.model_registry import ModelRegistry, load_registry
 from service.ports import Compute, MeshFormat, Outcome, SampleFormat
 from service.presentation import model_summary, summary_of
+from service.provenance import metadata_of
 from service.request_schemas import parse_annotated, parse_labels
 from service.schemas import EstimateSchema, ModelList, Summary
 from service.settings import Settings, load_settings
@@ -150,19 +151,17 @@ def models(context: typer.Context, as_json: JsonOption = False) -> None:
 
 
 def _read(settings: Settings, masks: list[Path], labels: frozenset[int] | None) -> tuple[MaskStack, ...]:
-    read = mask_reader(settings)
     for number, path in enumerate(masks):
         if not path.is_file():
             raise InvalidParameter(f"Each MASK must be a file; there is no file {path}.", part=f"mask[{number}]")
-    return tuple(stack for number, path in enumerate(masks) for stack in read(path, f"mask[{number}]", labels))
+    return use_cases.stacks_of(mask_reader(settings), masks, labels, settings.max_voxels)
 
 
 def _write_mesh(outcome: Outcome, path: Path | None, format: str, max_error_mm: float) -> None:
     if path is None:
         return
-    metadata = {"model": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest}
     mesh = decimated(outcome.reconstruction.mesh, max_error_mm)
-    path.write_bytes(write_mesh(mesh, format, space=outcome.reconstruction.space, metadata=metadata))
+    path.write_bytes(write_mesh(mesh, format, space=outcome.reconstruction.space, metadata=metadata_of(outcome)))
 
 
 def _write_volume(

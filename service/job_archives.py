@@ -1,5 +1,6 @@
 """The masks of a ZIP that was sent: which of its members they are, and how much they may hold together."""
 
+import io
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ _DAMAGED = (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zli
 #: Others are inflated without a bound by the library.
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 0x1
+#: Room that a mask may take in the list of members, with what systems put beside it.
+MEMBER_BYTES = 512
 _CHUNK = 1 << 20
 
 
@@ -43,14 +46,40 @@ class ArchivedMask:
     problem: InputError | None = None
 
 
-def open_archive(archive: BinaryIO) -> zipfile.ZipFile:
+class _ShortReads(io.RawIOBase):
+    """An archive of which nothing is read that is longer than the list of members may be: that is read at once."""
+
+    def __init__(self, archive: BinaryIO, most: int) -> None:
+        self._archive = archive
+        self._most = most
+
+    def read(self, size: int = -1) -> bytes:
+        if size > self._most:
+            raise TooLarge("The archive's list of members is longer than that of any job's masks.", part="archive")
+        return self._archive.read(size)
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        return self._archive.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._archive.tell()
+
+    def seekable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return True
+
+
+def open_archive(archive: BinaryIO, limits: ArchiveLimits) -> zipfile.ZipFile:
     """The archive with the list of its members read.
 
     Raises:
         InvalidParameter: not a ZIP, or one whose list of members is damaged.
+        TooLarge: a list that is longer than so many masks need, whatever else is beside them.
     """
     try:
-        return zipfile.ZipFile(archive)
+        return zipfile.ZipFile(_ShortReads(archive, max(limits.max_masks * MEMBER_BYTES, _CHUNK)))
     except _DAMAGED:
         raise InvalidParameter("The part archive must be a ZIP that is whole.", part="archive") from None
 
@@ -75,7 +104,7 @@ def masks_in(archive: BinaryIO, limits: ArchiveLimits) -> Iterator[ArchivedMask]
         InvalidParameter, TooLarge: see `open_archive` and `masks_of`.
     """
     unpacked = 0
-    with open_archive(archive) as opened:
+    with open_archive(archive, limits) as opened:
         for info in masks_of(opened, limits):
             mask = _read(opened, info, limits)
             unpacked += len(mask.content)

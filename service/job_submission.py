@@ -119,7 +119,7 @@ def require_archive(archive: BinaryIO, annotated: AnnotatedRule | Sequence[Plane
         InvalidParameter: no ZIP, or planes of other stacks than the first of each mask; DICOM objects may have several.
         TooLarge: more masks than a job may have, or larger ones.
     """
-    with open_archive(archive) as opened:
+    with open_archive(archive, limits) as opened:
         names = [info.filename.lower() for info in masks_of(opened, limits)]
     if not any(name.endswith(".dcm") for name in names):
         require_stacks(annotated, 1)

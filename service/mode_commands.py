@@ -17,6 +17,7 @@ from service.commands import ForceOption, JsonOption, ModelOption
 from service.console import echo_json, progress, writing
 from service.mode_presentation import mode_list
 from service.ports import MeshFormat
+from service.provenance import metadata_of
 from service.settings import load_settings
 
 
@@ -72,7 +73,7 @@ def _write(
     force: bool,
 ) -> None:
     manifest = model.manifest
-    said = {"model": manifest.name, "version": manifest.version, "digest": model.digest}
+    said = metadata_of(model)
     paths = {name: folder / f"{manifest.name}-{name}.{format.value}" for name in ends}
     _require_free(folder, paths.values(), force=force)
     with progress(len(ends)) as step:

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
-from model.bundle import ShapeModel, open_bundle
+from packaging.version import InvalidVersion, Version
+
+from model.bundle import MANIFEST, ShapeModel, open_bundle
 from model.errors import BundleError, InvalidParameter, UnknownModel
 from service.settings import Settings
 
-MANIFEST = "manifest.json"
 #: Between a model's name and its version.
 AT = "@"
 
@@ -189,8 +190,12 @@ def _newest(models: Iterable[ShapeModel]) -> dict[str, ShapeModel]:
     return {model.manifest.name: model for model in sorted(models, key=lambda model: _order(model.manifest.version))}
 
 
-def _order(version: str) -> tuple[int, ...]:
-    return tuple(int(number) for number in re.findall(r"\d+", version))
+def _order(version: str) -> tuple[Version, str]:
+    """By the rules of Python packages: what comes before a release is older; of other texts their numbers count."""
+    try:
+        return Version(version), version
+    except InvalidVersion:
+        return Version(".".join(re.findall(r"[0-9]+", version)) or "0"), version
 
 
 def _digests(models: Mapping[str, ShapeModel]) -> dict[str, str]:

@@ -153,8 +153,9 @@ def load_settings(overrides: Mapping[str, Any] | None = None) -> Settings:
         InvalidParameter: a value is out of its range, a key is unknown, or the file cannot be read.
     """
     file = os.environ.get(SETTINGS_FILE_VARIABLE)
+    unread = InvalidParameter(f"{SETTINGS_FILE_VARIABLE} must name a readable TOML file.", part=SETTINGS_FILE_VARIABLE)
     if file and not Path(file).is_file():
-        raise InvalidParameter(f"{SETTINGS_FILE_VARIABLE} must name a readable TOML file.", part=SETTINGS_FILE_VARIABLE)
+        raise unread
     try:
         return Settings(**(overrides or {}))
     except ValidationError as fault:
@@ -162,6 +163,8 @@ def load_settings(overrides: Mapping[str, Any] | None = None) -> Settings:
         name = ".".join(map(str, first["loc"])) or "settings"
         reason = first["msg"].removeprefix("Value error, ")
         raise InvalidParameter(f"The setting {name} is not valid: {reason}.", part=name) from None
+    except OSError:
+        raise unread from None
     except ValueError:
         raise InvalidParameter(f"{SETTINGS_FILE_VARIABLE} must hold valid TOML.", part=SETTINGS_FILE_VARIABLE) from None
 

@@ -1,6 +1,6 @@
 """What the service can do, as plain functions of domain types: no HTTP, no settings, no clock."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from model.inference.modes import ShapeModes, shape_along
 from model.inference.next_plane import Among, NextPlane
 from model.inference.next_plane import next_plane as best_plane
 from model.inference.observations import AnnotatedRule, MaskStack, Plane, find_planes
-from model.inference.one_body import OCCUPIED, body_mask, body_probability
+from model.inference.one_body import body_mask, body_probability
 from model.inference.posterior_shapes import PosteriorShape, draw_posterior
 from model.inference.reconstruction import SURFACE_SD, Options, Watch, farthest_mm, unwatched
 from model.inference.reconstruction import reconstruct as infer
@@ -28,7 +28,7 @@ from model.inference.uncertainty import ShapeState, voxel_entropy
 from model.interruption import Check, interruptible, unchecked
 from service.cautions import coarse_cautions
 from service.errors import NotComputed
-from service.ports import Catalogue, ModeSource, Outcome
+from service.ports import Catalogue, MaskReader, MaskSource, ModeSource, Outcome
 
 #: Largest seed; exact as a JSON number everywhere.
 MAX_SEED = 2**53 - 1
@@ -63,6 +63,32 @@ def reconstruct(
     return Outcome(manifest.name, manifest.version, model.digest, options, stacks[0].grid, told)
 
 
+def stacks_of(
+    read: MaskReader,
+    masks: Iterable[MaskSource],
+    labels: frozenset[int] | None,
+    max_voxels: int,
+    check: Check = unchecked,
+) -> tuple[MaskStack, ...]:
+    """The stacks of all masks of one drawing in their order; the check is passed before each mask.
+
+    Raises:
+        InputError: a mask cannot be used; names it as ``mask[0]``, ``mask[1]`` and so on.
+        TooLarge: they have more voxels together than allowed.
+    """
+    stacks: list[MaskStack] = []
+    for number, mask in enumerate(masks):
+        check()
+        part = f"mask[{number}]"
+        stacks += read(mask, part, labels)
+        if sum(stack.foreground.size for stack in stacks) > max_voxels:
+            raise TooLarge(
+                f"The masks up to {part} have more than {max_voxels} voxels together, the most that is accepted.",
+                part=part,
+            )
+    return tuple(stacks)
+
+
 def notes_of(stacks: Sequence[MaskStack]) -> tuple[str, ...]:
     """What the stacks' notes say, each once."""
     return tuple(dict.fromkeys(note for stack in stacks for note in stack.notes))
@@ -88,20 +114,27 @@ def probability_map(
         NotComputed: the model that made the outcome is no longer loaded.
         TooLarge: the grid has more voxels than allowed.
     """
-    model = interruptible(_same_model(catalogue, outcome), check)
-    mesh = outcome.reconstruction.mesh
-    grid = outcome.grid if spacing_mm is None else covering_grid(mesh, spacing_mm)
-    require_voxels(grid, max_voxels)
-    probability = body_probability(model, outcome.reconstruction.state, mesh, grid)
+    model, grid = _model_and_grid(catalogue, outcome, spacing_mm, max_voxels, check)
+    probability = body_probability(model, outcome.reconstruction.state, outcome.reconstruction.mesh, grid)
     return Volume(probability.astype(np.float32), grid)
+
+
+def _model_and_grid(
+    catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int, check: Check
+) -> tuple[ShapeModel, Grid]:
+    model = interruptible(_same_model(catalogue, outcome), check)
+    grid = outcome.grid if spacing_mm is None else covering_grid(outcome.reconstruction.mesh, spacing_mm)
+    require_voxels(grid, max_voxels)
+    return model, grid
 
 
 def segmentation(
     catalogue: Catalogue, outcome: Outcome, spacing_mm: float | None, max_voxels: int, check: Check = unchecked
 ) -> Volume:
     """Label map, 1 where the object is more likely than not; grid and errors as in `probability_map`."""
-    volume = probability_map(catalogue, outcome, spacing_mm, max_voxels, check)
-    return Volume((volume.array >= OCCUPIED).astype(np.uint8), volume.grid)
+    model, grid = _model_and_grid(catalogue, outcome, spacing_mm, max_voxels, check)
+    inside = body_mask(model, outcome.reconstruction.state, outcome.reconstruction.mesh, grid)
+    return Volume(inside.astype(np.uint8), grid)
 
 
 def entropy_map(

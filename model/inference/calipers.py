@@ -31,8 +31,8 @@ MOST_EXTENTS = 32
 #: More points than this that the longest diameter may join are thinned out before all their distances are taken.
 MOST_CORNERS = 2000
 
-_NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
-_DIRECTION = re.compile(rf"{_NUMBER}(\s+{_NUMBER}){{2}}\Z")
+#: Each of its digits can be read in one way only, so that the time to refuse a text is that to read it.
+_NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ def parse_extents(text: str) -> tuple[str, ...]:
         InvalidParameter: something else, or too many.
     """
     words = list(dict.fromkeys(" ".join(word.split()) for word in text.split(",") if word.strip()))
-    for word in words:
-        direction_of(word)
     if len(words) > MOST_EXTENTS:
         raise InvalidParameter(f"extents names {len(words)}; at most {MOST_EXTENTS} are accepted.", part="extents")
+    for word in words:
+        direction_of(word)
     return tuple(words)
 
 
@@ -78,8 +78,9 @@ def direction_of(along: str, space: Space = "RAS") -> Float[np.ndarray, "3"] | N
         return None
     if along in AXES:
         return np.array(AXES[along])
-    if _DIRECTION.match(along):
-        vector = np.array([float(number) for number in along.split()])
+    numbers = along.split()
+    if len(numbers) == 3 and all(map(_NUMBER.fullmatch, numbers)):
+        vector = np.array([float(number) for number in numbers])
         with np.errstate(over="ignore"):
             length = float(np.linalg.norm(vector))
         if 0.0 < length < np.inf:

@@ -25,6 +25,7 @@ from model.inference.observations import Plane
 from model.inference.reconstruction import Options, PlaneResidual, Reconstruction
 from model.inference.uncertainty import ShapeState
 from service.ports import Outcome
+from service.provenance import named_model
 
 SUMMARY, STATE, MESH = "summary.json", "state.npz", "mesh.npz"
 #: Format of the folder; other ones are not read.
@@ -119,7 +120,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 def _document(outcome: Outcome) -> dict[str, Any]:
     answer = outcome.reconstruction
     return {
-        "model": {"name": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest},
+        "model": named_model(outcome),
         "options": asdict(outcome.options),
         "grid": {"shape": list(map(int, outcome.grid.shape)), "affine": outcome.grid.affine.tolist()},
         "fits": [_fit_document(fit) for fit in answer.state.fits],

@@ -6,7 +6,6 @@ it. A segmentation whose segments overlap has a leading axis of layers, which ar
 """
 
 import re
-import warnings
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
@@ -24,6 +23,7 @@ from service.adapters.image_guard import (
     checked_shape,
 )
 from service.adapters.nrrd_layers import checked_layers, layers_by_value, merged
+from service.adapters.quiet import quiet
 from service.adapters.voxels import Stored, read_voxels
 
 MAGIC = b"NRRD00"
@@ -146,8 +146,7 @@ def _parsed(header: _Header, part: str) -> dict[str, Any]:
             part=part,
         )
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with quiet():
             return dict(nrrd.read_header([header.version, *(f"{name}: {value}" for name, value in known.items())]))
     except (nrrd.NRRDError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise _damaged(part) from error

@@ -11,6 +11,7 @@ from model.inference.mesh import area_cm2, volume_ml
 from model.inference.posterior_shapes import PosteriorShape
 from service.adapters.sample_files import SampleFile
 from service.ports import MeshFormat, MeshWriter
+from service.provenance import metadata_of, named_model
 from service.use_cases import Posterior
 
 
@@ -30,14 +31,14 @@ class PosteriorWriter:
         if shape.mesh.is_empty:
             return SampleFile("", b"", {"file": None, **_entry(shape, seed)})
         name = f"posterior-{seed}.{self._format.value}"
-        said = {**_model(posterior), "seed": seed}
+        said = {**metadata_of(posterior.outcome), "seed": seed}
         data = self._write_mesh(shape.mesh, self._format.value, space=_space(posterior), metadata=said)
         return SampleFile(name, data, {"file": name, **_entry(shape, seed)})
 
     def manifest(self, posterior: Posterior, identifier: str, entries: Sequence[dict[str, Any]]) -> bytes:
         """``manifest.json`` of a batch."""
         document = {
-            "model": _model(posterior),
+            "model": named_model(posterior.outcome),
             "reconstruction": identifier,
             "uncertainty": posterior.outcome.options.uncertainty,
             "space": _space(posterior),
@@ -51,11 +52,6 @@ class PosteriorWriter:
 
 def _space(posterior: Posterior) -> Space:
     return posterior.outcome.reconstruction.space
-
-
-def _model(posterior: Posterior) -> dict[str, object]:
-    outcome = posterior.outcome
-    return {"name": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest}
 
 
 def _entry(shape: PosteriorShape, seed: int) -> dict[str, Any]:

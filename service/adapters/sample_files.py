@@ -18,6 +18,7 @@ from model.interruption import Check, interruptible
 from service import use_cases
 from service.job_results import counts_of
 from service.ports import MeshWriter, SampleFormat, VolumeWriter
+from service.provenance import metadata_of, named_model
 
 MANIFEST = "manifest.json"
 
@@ -78,7 +79,7 @@ class SampleWriter:
                 return self._write_volume(volume.array, volume.grid, "synthetic shape"), {}
             case SampleFormat.PAIRS:
                 return _pair(_label_map(model, shape, how), seed)
-        said = {**provenance(model), "seed": seed}
+        said = {**metadata_of(model), "seed": seed}
         return self._write_mesh(shape.mesh, how.format.value, space=model.manifest.frame, metadata=said), {}
 
 
@@ -114,16 +115,11 @@ def suffix(format: SampleFormat) -> str:
     return special.get(format, format.value)
 
 
-def provenance(model: ShapeModel) -> dict[str, object]:
-    """What a file says of the model that made it."""
-    return {"model": model.manifest.name, "version": model.manifest.version, "digest": model.digest}
-
-
 def manifest_bytes(model: ShapeModel, how: Draw, entries: Sequence[dict[str, Any]]) -> bytes:
     """``manifest.json`` of a batch."""
     manifest = model.manifest
     document = {
-        "model": {"name": manifest.name, "version": manifest.version, "digest": model.digest},
+        "model": named_model(model),
         "space": manifest.frame,
         "unit": manifest.units,
         "format": how.format.value,

@@ -163,7 +163,7 @@ def _reconstruct(tools: DrawingTools, item: Record, check: Check) -> Record:
     key = _key(str(drawing.SOPInstanceUID), content_digest(drawing, stacks, labels), outcome, labels)
     anatomy, side = anatomy_of(model.manifest), side_of(drawing, labels)
     derivation = Derivation(drawing, series, outcome, anatomy, key, tools.version, labels, side)
-    volume = use_cases.probability_map(tools.registry, outcome, None, tools.limits.max_voxels)
+    volume = use_cases.probability_map(tools.registry, outcome, None, tools.limits.max_voxels, check)
     results = result_objects(derivation, volume.array, desk.moment_s(item["object"]))
     desk.put_results(item["object"], results)
     return {"state": DONE, "cut": derivation.is_cut}

@@ -13,6 +13,7 @@ from service.job_submission import SUBMISSION
 from service.jobs.tools import JobTools, labels_of, options_of
 from service.ports import RECONSTRUCTION_JOB, RECONSTRUCTIONS_JOB, Outcome
 from service.presentation import summary_of
+from service.provenance import metadata_of
 
 #: Choices of a job that are longer than this (characters of JSON) are kept once, in a note, and not with each part.
 BRIEF = 2048
@@ -106,9 +107,8 @@ def _refused(name: str, error: InputError) -> Record:
 
 
 def _put(tools: JobTools, files: JobFiles, number: int, name: str, format: str, outcome: Outcome) -> None:
-    metadata = {"model": outcome.model_name, "version": outcome.model_version, "digest": outcome.model_digest}
     answer = outcome.reconstruction
-    surface = tools.write_mesh(answer.mesh, format, space=answer.space, metadata=metadata)
+    surface = tools.write_mesh(answer.mesh, format, space=answer.space, metadata=metadata_of(outcome))
     summary = json.loads(summary_of(outcome).model_dump_json())
     file = f"{number:06d}.{format}"
     files.put_item(number, {file: surface}, {"mask": name, "file": file, "summary": summary})
@@ -117,7 +117,5 @@ def _put(tools: JobTools, files: JobFiles, number: int, name: str, format: str, 
 def _reconstruct(tools: JobTools, item: Record, sources: list[bytes], check: Check) -> Outcome:
     labels, options = labels_of(item), options_of(item)
     model = tools.registry.get(item["model"])
-    stacks = tuple(
-        stack for number, data in enumerate(sources) for stack in tools.read_mask(data, f"mask[{number}]", labels)
-    )
+    stacks = use_cases.stacks_of(tools.read_mask, sources, labels, tools.max_voxels, check)
     return use_cases.reconstruct(model, stacks, options, tools.max_voxels, check=check)

@@ -9,10 +9,10 @@ from starlette.responses import Response
 from model.interruption import Check
 from service import use_cases
 from service.ports import MeshFormat
+from service.provenance import metadata_of
 from service.request_schemas import ComparisonQuery
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import ResultId, Services, WithServices, WithTicket, result_of_parameter
-from service.routes.meshes import metadata_of_outcome
 from service.routes.reconstructions import PATH
 from service.routes.responses import MESH_MEDIA_TYPES, attachment, files, problems
 from service.routes.strict import StrictRoute
@@ -57,5 +57,5 @@ def _comparison(services: Services, identifier: str, query: ComparisonQuery, che
     mesh = use_cases.compare(outcome, other)
     check()
     format, space = MeshFormat(query.format), query.space or outcome.reconstruction.space
-    data = services.write_mesh(mesh, format.value, space=space, metadata=metadata_of_outcome(outcome))
+    data = services.write_mesh(mesh, format.value, space=space, metadata=metadata_of(outcome))
     return Response(data, media_type=MESH_MEDIA_TYPES[format], headers=attachment(f"comparison.{format.value}"))

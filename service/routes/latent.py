@@ -16,10 +16,10 @@ from service import use_cases
 from service.adapters.sample_files import MANIFEST, SampleFile
 from service.latent_schemas import Features, InterpolationQuery
 from service.ports import Outcome
+from service.provenance import metadata_of
 from service.routes.archives import ArchiveResponse, MakeFile
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import ResultId, Services, WithServices, WithTicket, result_of_parameter
-from service.routes.meshes import metadata_of_model
 from service.routes.reconstructions import PATH
 from service.routes.responses import MESH_MEDIA_TYPES, ZIP, attachment, files, problems
 from service.routes.strict import StrictRoute
@@ -100,7 +100,7 @@ def _wire(outcome: Outcome, found: LatentFeatures) -> Features:
 
 
 def _bytes(services: Services, way: use_cases.Way, query: InterpolationQuery, at: float, check: Check) -> bytes:
-    metadata = {**metadata_of_model(way.model), "at": f"{at:g}"}
+    metadata = {**metadata_of(way.model), "at": f"{at:g}"}
     return services.write_mesh(way.shape(at, check), query.format.value, space=way.space, metadata=metadata)
 
 

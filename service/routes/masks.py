@@ -6,15 +6,13 @@ from fastapi import UploadFile
 
 from model.inference.mask_stack import MaskStack
 from model.interruption import Check
+from service import use_cases
 from service.routes.dependencies import Services
 
 
-def read_stacks(
+def masks_of_form(
     services: Services, masks: Sequence[UploadFile], labels: frozenset[int] | None, check: Check
 ) -> tuple[MaskStack, ...]:
-    """The stacks of all parts in their order; the check is passed before each part."""
-    stacks: list[MaskStack] = []
-    for number, mask in enumerate(masks):
-        check()
-        stacks += services.read_mask(mask.file, f"mask[{number}]", labels)
-    return tuple(stacks)
+    """See `use_cases.stacks_of`."""
+    files = (mask.file for mask in masks)
+    return use_cases.stacks_of(services.read_mask, files, labels, services.settings.max_voxels, check)

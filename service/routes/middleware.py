@@ -95,7 +95,7 @@ class KeyMiddleware:
     def _accepted(self, headers: Headers) -> bytes | None:
         scheme, _, token = headers.get("authorization", "").partition(" ")
         offered = [headers.get("x-api-key", ""), token.strip() if scheme.lower() == "bearer" else ""]
-        matches = [key for given in offered for key in self._keys if hmac.compare_digest(given.encode(), key)]
+        matches = [key for given in offered for key in self._keys if hmac.compare_digest(given.encode("latin-1"), key)]
         return matches[0] if matches else None
 
 

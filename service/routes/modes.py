@@ -12,6 +12,7 @@ from model.interruption import Check
 from service import use_cases
 from service.mode_presentation import mode_list
 from service.mode_schemas import ModeList, ModeMeshQuery, ModeQuery, ShapeQuery, parse_coordinates
+from service.provenance import metadata_of
 from service.routes.caching import (
     CONDITIONAL,
     cached,
@@ -23,7 +24,6 @@ from service.routes.caching import (
 )
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithModel, WithServices, address
-from service.routes.meshes import metadata_of_model
 from service.routes.models import PATH
 from service.routes.responses import MESH_MEDIA_TYPES, Responses, attachment, files, problems
 from service.routes.strict import StrictRoute
@@ -116,7 +116,7 @@ def _bytes(
     modes = use_cases.modes_of(model, services.modes, check)
     mesh = use_cases.shape_along_modes(model, modes, coordinates, query.spacing_mm, limit, check)
     where = " ".join(f"{rank}:{sd:g}" for rank, sd in sorted(coordinates.items()))
-    metadata = {**metadata_of_model(model), "modes": where}
+    metadata = {**metadata_of(model), "modes": where}
     return services.write_mesh(mesh, query.format.value, space=model.manifest.frame, metadata=metadata)
 
 

@@ -12,7 +12,7 @@ from service.presentation import drawn_planes
 from service.request_schemas import PlanesForm, parse_annotated, parse_labels
 from service.routes.connection import run_while_connected
 from service.routes.dependencies import Services, WithServices, WithTicket
-from service.routes.masks import read_stacks
+from service.routes.masks import masks_of_form
 from service.routes.responses import problems
 from service.routes.strict import StrictRoute
 from service.schemas import DrawnPlanes
@@ -48,5 +48,5 @@ async def read_planes(
 def _planes(services: Services, form: PlanesForm, check: Check) -> DrawnPlanes:
     labels = parse_labels(form.label)
     rule = parse_annotated(form.annotated)
-    stacks = read_stacks(services, form.mask, labels, check)
+    stacks = masks_of_form(services, form.mask, labels, check)
     return drawn_planes(stacks, use_cases.annotated_planes(stacks, rule))

@@ -30,7 +30,7 @@ from service.routes.job_requests import (
     submittable_model,
     wants_job,
 )
-from service.routes.masks import read_stacks
+from service.routes.masks import masks_of_form
 from service.routes.meshes import mesh_bytes
 from service.routes.negotiation import listed, negotiate
 from service.routes.responses import DIRECT_FORMATS, JSON, MESH_MEDIA_TYPES, attachment, files, problems
@@ -126,7 +126,7 @@ def _reconstruct(services: Services, form: ReconstructionForm, check: Check) -> 
         model = services.registry.get(form.model)
     except UnknownModel as error:
         raise InvalidParameter(str(error), part="model") from None
-    stacks = read_stacks(services, form.mask, labels, check)
+    stacks = masks_of_form(services, form.mask, labels, check)
     timer = StageTimer(services.metrics.stages)
 
     def observed(stage: str) -> None:

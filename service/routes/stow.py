@@ -10,7 +10,7 @@ from python_multipart.exceptions import MultipartParseError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.responses import JSONResponse, Response
 
-from model.errors import NotFound
+from model.errors import NotFound, TooLarge
 from service.errors import StoreFull, UnsupportedMediaType
 from service.full_disks import is_full
 from service.pacs_ports import Disposition, ObjectReceiver, Receipt
@@ -23,6 +23,8 @@ MEDIA_TYPE = "application/dicom+json"
 SENDER = "STOW-RS"
 #: Failure reasons of an object (PS3.18, I.2.2): not understood; not kept; not what the request says that it is.
 CANNOT_UNDERSTAND, PROCESSING_FAILURE, DOES_NOT_MATCH = 0xC000, 0x0110, 0xA900
+#: Objects that one request may hold; each costs a temporary file, a turn of the disk and a line of the audit trail.
+MOST_OBJECTS = 10_000
 #: Bytes of an object that are in memory while the others are received; the rest is on the disk.
 IN_MEMORY = 1 << 20
 
@@ -64,7 +66,7 @@ def stow_router() -> APIRouter:
             200: {"description": "all were taken", "content": {MEDIA_TYPE: {"schema": {"type": "object"}}}},
             202: {"description": "some were taken", "content": {MEDIA_TYPE: {"schema": {"type": "object"}}}},
             409: {"description": "none was taken", "content": {MEDIA_TYPE: {"schema": {"type": "object"}}}},
-            **problems(400, 404, 413, 415, 507),
+            **problems(400, 404, 413, 415, 503, 507),
         },
     }
     router.add_api_route(PATH, store_instances, summary="Take DICOM objects (STOW-RS)", **shared)
@@ -108,12 +110,13 @@ async def parts_of(request: Request, boundary: bytes, kept: ExitStack) -> list[I
 
     Raises:
         UnsupportedMediaType: the body is not complete.
+        TooLarge: more than `MOST_OBJECTS` parts.
         StoreFull: the disk of temporary files has no room for the body.
     """
     parts: list[IO[bytes]] = []
     ended: list[bool] = []
     callbacks: Any = {
-        "on_part_begin": lambda: parts.append(_begun(kept)),
+        "on_part_begin": lambda: parts.append(_begun(kept, len(parts))),
         "on_part_data": lambda data, start, end: parts[-1].write(data[start:end]),
         "on_end": lambda: ended.append(True),
     }
@@ -133,7 +136,9 @@ async def parts_of(request: Request, boundary: bytes, kept: ExitStack) -> list[I
     return parts
 
 
-def _begun(kept: ExitStack) -> IO[bytes]:
+def _begun(kept: ExitStack, earlier: int) -> IO[bytes]:
+    if earlier == MOST_OBJECTS:
+        raise TooLarge(f"The request's body must not hold more than {MOST_OBJECTS} objects.", part="body")
     file = SpooledTemporaryFile(IN_MEMORY)  # noqa: SIM115 - the stack closes it
     kept.callback(_close, file)
     return file

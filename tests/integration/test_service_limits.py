@@ -180,6 +180,13 @@ def test_a_key_is_asked_for_where_one_is_set(tmp_path):
             problem(client.get("/v1/models", headers=headers), 401)
 
 
+def test_a_key_may_hold_any_letters(tmp_path):
+    with running(app_for(tmp_path, api_keys=("schlüssel",))) as client:
+        for sent, status in (("schlüssel", 200), ("schlussel", 401)):
+            headers = {b"X-API-Key": sent.encode()}
+            assert client.get("/v1/models", headers=headers).status_code == status
+
+
 @pytest.mark.parametrize(
     "path", ["/healthz", "/readyz", "/docs", "/openapi.json", "/static-offline-docs/swagger-ui.css"]
 )

@@ -21,7 +21,7 @@ from pydicom.valuerep import DSfloat
 
 from model.errors import InputError
 from model.geometry import Grid
-from service.adapters.dicom.objects import quiet
+from service.adapters.quiet import quiet
 
 #: Elements of patient and study that every image has to have, if without a value (type 2; PS3.3, C.7.1.1 and C.7.2.1).
 COMMON = (

@@ -12,10 +12,11 @@ from model.errors import InvalidGeometry, InvalidMask, UnreadableImage
 from model.geometry import Grid
 from model.inference.mask_stack import MaskStack
 from model.inference.stacks import checked_labels
+from service.adapters.dicom.contours import drawn_regions, frame_of_regions, images_of_regions
 from service.adapters.dicom.objects import read_object, tolerant
 from service.adapters.dicom.planes import ImageGrid
 from service.adapters.dicom.segmentations import SEGMENTATIONS, drawn_segments, read_segmentation
-from service.adapters.dicom.structure_sets import drawn_regions, frame_of_regions, images_of_regions, read_structure_set
+from service.adapters.dicom.structure_sets import read_structure_set
 from service.adapters.image_guard import ImageLimits
 
 #: SOP classes of drawings that are read.

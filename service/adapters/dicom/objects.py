@@ -5,10 +5,8 @@ meets what a stranger sent. Deflated data sets are refused, since they would be 
 size is known.
 """
 
-import threading
-import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from typing import BinaryIO
 
 import numpy as np
@@ -20,6 +18,7 @@ from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossl
 
 from model.errors import InvalidMask, TooLarge, UnreadableImage
 from service.adapters.image_guard import ImageLimits, checked_shape
+from service.adapters.quiet import quiet
 
 #: Where the prefix of a file stands (PS3.10, 7.1).
 PREFIX = slice(128, 132)
@@ -53,34 +52,6 @@ def read_object(file: BinaryIO, part: str) -> Dataset:
             )
         file.seek(0)
         return dcmread(file)
-
-
-class _Quiet:
-    """Warnings off while any thread asks for it: their filters are of the whole process."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._users = 0
-        self._scope = ExitStack()
-
-    @contextmanager
-    def __call__(self) -> Iterator[None]:
-        with self._lock:
-            self._users += 1
-            if self._users == 1:
-                self._scope.enter_context(warnings.catch_warnings())
-                warnings.simplefilter("ignore")
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._users -= 1
-                if self._users == 0:
-                    self._scope.close()
-
-
-#: No warnings about values within: they hold them.
-quiet = _Quiet()
 
 
 @contextmanager

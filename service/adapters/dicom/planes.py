@@ -4,14 +4,14 @@ Pixels are counted along a row first: index axes are column, row and plane, as i
 `model.geometry`.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydicom import Dataset
 
-from model.errors import InvalidGeometry
+from model.errors import InvalidGeometry, TooLarge
 from model.geometry import Grid, slab
 from service.adapters.dicom.objects import tolerant
 from service.adapters.image_guard import LPS_TO_RAS
@@ -34,6 +34,11 @@ MOST_PARTS = 10_000
 ROUNDING = 1e-6
 #: Planes named in a message, at most.
 LISTED_PLANES = 4
+#: Directions and places of which the planes of a drawing may be, at most.
+MOST_GROUPS = 512
+
+#: Whether each of some numbered things is like one of them.
+Alike = Callable[[int, Int[np.ndarray, "n"]], Bool[np.ndarray, "n"]]
 
 
 @dataclass(frozen=True)
@@ -139,21 +144,44 @@ def _orthonormal(row: Float[np.ndarray, "3"], column: Float[np.ndarray, "3"]) ->
     return bool(np.abs(gram - [1.0, 1.0, 0.0]).max() < PARALLEL)
 
 
-def parallel_groups(planes: Sequence[FramePlane]) -> list[list[int]]:
-    """Numbers of the planes that can be one stack: parallel, of one spacing, in register."""
+def parallel_groups(planes: Sequence[FramePlane], part: str) -> list[list[int]]:
+    """Numbers of the planes that can be one stack: parallel, of one spacing, in register.
+
+    Raises:
+        TooLarge: more than `MOST_GROUPS` stacks.
+    """
+    axes = np.array([[plane.row, plane.column] for plane in planes])
+    spacings, origins = np.array([plane.spacing for plane in planes]), np.array([plane.origin for plane in planes])
+
+    def alike(first: int, others: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+        turned = np.abs(axes[others] - axes[first]).max(axis=(1, 2)) <= PARALLEL
+        scaled = np.isclose(spacings[first], spacings[others], rtol=1e-3).all(axis=1)
+        shift = np.abs((origins[others] - origins[first]) @ axes[first].T) / spacings[first]
+        return np.asarray(turned & scaled & (shift.max(axis=1) <= REGULAR_SHARE))
+
+    return in_groups(len(planes), alike, part)
+
+
+def in_groups(count: int, alike: Alike, part: str) -> list[list[int]]:
+    """Numbers from 0 on, each in the first group whose first number it is like.
+
+    Raises:
+        TooLarge: more than `MOST_GROUPS` groups.
+    """
     groups: list[list[int]] = []
-    for number, plane in enumerate(planes):
-        home = next((group for group in groups if _in_register(planes[group[0]], plane)), None)
-        if home is None:
-            groups.append([number])
-        else:
-            home.append(number)
+    rest = np.arange(count)
+    while len(rest):
+        if len(groups) == MOST_GROUPS:
+            raise TooLarge(
+                f"{part} draws on planes of more than {MOST_GROUPS} directions or places, the most that are accepted; "
+                "planes of few stacks are",
+                part=part,
+            )
+        same = alike(int(rest[0]), rest)
+        same[0] = True
+        groups.append(rest[same].tolist())
+        rest = rest[~same]
     return groups
-
-
-def _in_register(first: FramePlane, second: FramePlane) -> bool:
-    shift = np.abs(first.offset(second)[:2]) / first.spacing
-    return _alike(first, second) and bool(shift.max() <= REGULAR_SHARE)
 
 
 def _alike(first: FramePlane, second: FramePlane) -> bool:

@@ -11,6 +11,7 @@ from model.inference.mesh import Mesh, transformed
 from service.adapters.dicom.derivation import MANUFACTURER, Derivation, algorithm, property_type, references
 from service.adapters.image_guard import LPS_TO_RAS
 from service.adapters.mesh_formats import write_mesh
+from service.provenance import metadata_of
 
 #: Grey value and CIELab colour that viewers show the surface in.
 GREY, CIELAB = 0xB000, (0xB000, 0xA000, 0xA400)
@@ -19,8 +20,8 @@ GREY, CIELAB = 0xB000, (0xB000, 0xA000, 0xA400)
 def encapsulated_stl(derivation: Derivation) -> Dataset:
     """The surface as a binary STL file within an object."""
     found = _object(derivation, EncapsulatedSTLStorage, "M3D", "model", "stl")
-    metadata = {"model": derivation.outcome.model_name, "version": derivation.outcome.model_version}
-    document = write_mesh(derivation.outcome.reconstruction.mesh, "stl", space="LPS", metadata=metadata)
+    outcome = derivation.outcome
+    document = write_mesh(outcome.reconstruction.mesh, "stl", space="LPS", metadata=metadata_of(outcome))
     found.BurnedInAnnotation, found.RecognizableVisualFeatures = "NO", "NO"
     found.DocumentTitle = derivation.description("Surface")
     found.ConceptNameCodeSequence = _coded(Code("85040-5", "LN", "CT or MR Guidance surface"))

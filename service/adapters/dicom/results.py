@@ -11,10 +11,10 @@ from pydicom.valuerep import DA, TM
 from model.inference.one_body import OCCUPIED
 from model.inference.uncertainty import voxel_entropy
 from service.adapters.dicom.derivation import Derivation
-from service.adapters.dicom.objects import quiet
 from service.adapters.dicom.result_images import entropy_map, occupancy_map, segmentation
 from service.adapters.dicom.result_report import report
 from service.adapters.dicom.result_surfaces import encapsulated_stl, surface_segmentation
+from service.adapters.quiet import quiet
 
 #: Names of the results, in the order in which they are sent: what is referred to comes first.
 RESULTS = ("segmentation", "occupancy", "entropy", "stl", "surface", "report")

@@ -60,7 +60,7 @@ def read_segmentation(
     planes = frame_planes(found, part)
     if len(planes) != count:
         raise InvalidMask(f"{part} places {len(planes)} of its {count} frames; a place for each is needed", part=part)
-    stacks = _stacks_of_frames(planes, columns, rows, home, limits)
+    stacks = _stacks_of_frames(planes, columns, rows, home, part, limits)
     grids = [stack.grid for stack in stacks]
     require_room(grids, part, limits)
     seat = {
@@ -76,10 +76,10 @@ def read_segmentation(
 
 
 def _stacks_of_frames(
-    planes: Sequence[FramePlane], columns: int, rows: int, home: Grid | None, limits: ImageLimits
+    planes: Sequence[FramePlane], columns: int, rows: int, home: Grid | None, part: str, limits: ImageLimits
 ) -> list[DrawnStack]:
     """Stacks that hold each frame once; those of frames on the images are the images'."""
-    groups = parallel_groups(planes)
+    groups = parallel_groups(planes, part)
     stacks = []
     for group in groups:
         chosen = [planes[number] for number in group]

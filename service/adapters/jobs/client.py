@@ -57,7 +57,7 @@ _FAULT = "The job met a fault of the service; its logs hold more under the job's
 
 #: What a database, or the way to it, may raise; the first four say that it is away for now, or has no room.
 _AWAY = (OperationalError, InterfaceError, SQLAlchemyTimeout, sqlite3.OperationalError)
-_FAULTS = (*_AWAY, DBAPIError, sqlite3.Error, error.DBOSException)
+FAULTS = (*_AWAY, DBAPIError, sqlite3.Error, error.DBOSException)
 #: How PostgreSQL and SQLite say that a disk is full.
 _FULL = ("53100", "SQLITE_FULL")
 
@@ -69,7 +69,7 @@ def _answered(method: Callable[Concatenate["DbosJobs", P], T]) -> Callable[Conca
     def tried(jobs: "DbosJobs", /, *arguments: P.args, **named: P.kwargs) -> T:
         try:
             return method(jobs, *arguments, **named)
-        except _FAULTS as fault:
+        except FAULTS as fault:
             cause = _cause(fault)
             jobs.log.warning("jobs' database", kind=type(cause).__name__, state=_state(cause))
             if isinstance(cause, _AWAY):
@@ -100,7 +100,7 @@ def _needing_room() -> Iterator[None]:
     """What makes a job takes room in the database."""
     try:
         yield
-    except (*_FAULTS, OSError) as fault:
+    except (*FAULTS, OSError) as fault:
         if _state(_cause(fault)) in _FULL or is_full(fault):
             raise StoreFull("The jobs' database has no room for the job; send the request again later.") from fault
         raise

@@ -10,15 +10,15 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from dbos import DBOS, DBOSConfig, PortableWorkflowError, SetEnqueueOptions, SetWorkflowID, StepOptions
 from dbos import error as dbos_error
-from sqlalchemy.exc import DBAPIError
 
 from model.errors import MorphoFlowError
 from service.adapters.jobs.busy import Busy
-from service.adapters.jobs.client import PROGRESS, DbosJobs
+from service.adapters.jobs.client import FAULTS, PROGRESS, DbosJobs
 from service.adapters.jobs.database import (
     APPLICATION,
     DRAWING_PARTS_QUEUE,
@@ -102,8 +102,13 @@ def running_worker(kinds: Sequence[JobKind], options: WorkerOptions, log: Log | 
     DBOS.register_queue(PATIENT_QUEUE, worker_concurrency=PATIENT_FOLLOWED, polling_interval_sec=JOBS_POLL_S)
     for queue in (PARTS_QUEUE, DRAWING_PARTS_QUEUE):
         DBOS.register_queue(queue, worker_concurrency=1, polling_interval_sec=PARTS_POLL_S)
-    keeper = threading.Thread(target=_keep_lease, args=(leases, options, stop), name="lease", daemon=True)
-    keeper.start()
+    # By themselves, for what is taken over may have to wait for the database far longer than a lease lasts.
+    keepers = [
+        threading.Thread(target=_every, args=(turn, options.lease_s / 4, stop), name=turn.func.__name__, daemon=True)
+        for turn in (partial(leases.renew, options.executor), partial(_take_over, leases, options))
+    ]
+    for keeper in keepers:
+        keeper.start()
     try:
         yield
     finally:
@@ -113,7 +118,8 @@ def running_worker(kinds: Sequence[JobKind], options: WorkerOptions, log: Log | 
         DBOS._recover_pending_workflows([options.executor])
         DBOS.destroy(destroy_registry=True)
         stop.set()
-        keeper.join()
+        for keeper in keepers:
+            keeper.join(options.lease_s)
         leases.lapse(options.executor)  # a part that was taken from the queue in the meantime is the next worker's
         leases.close()
         jobs.close()
@@ -286,15 +292,19 @@ def _rarely(check: Check) -> Check:
     return checked
 
 
-def _keep_lease(leases: Leases, options: WorkerOptions, stop: threading.Event) -> None:
-    """Renew the own lease and take over what executors hold whose lease has run out."""
+def _every(turn: Callable[[], None], pause_s: float, stop: threading.Event) -> None:
+    """Take a turn now and then; one that the database fails is not the last."""
     ended = False
     while not ended:
-        with suppress(DBAPIError):  # the database is away; the next turn tries again
-            leases.renew(options.executor)
-            lost = [executor for executor in leases.lost(options.lease_s) if executor != options.executor]
-            if lost:
-                DBOS._recover_pending_workflows(lost)
-            for executor in lost:
-                leases.end(executor)
-        ended = stop.wait(options.lease_s / 4)
+        with suppress(*FAULTS):
+            turn()
+        ended = stop.wait(pause_s)
+
+
+def _take_over(leases: Leases, options: WorkerOptions) -> None:
+    """Take over what executors hold whose lease has run out."""
+    lost = [executor for executor in leases.lost(options.lease_s) if executor != options.executor]
+    if lost:
+        DBOS._recover_pending_workflows(lost)
+    for executor in lost:
+        leases.end(executor)

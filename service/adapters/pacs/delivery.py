@@ -13,12 +13,13 @@ from pydicom import Dataset, dcmread
 
 from model.errors import InvalidMask
 from service.adapters.dicom.masks import referenced_series, referenced_studies
-from service.adapters.dicom.objects import quiet, read_object
+from service.adapters.dicom.objects import read_object
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail
 from service.adapters.pacs.commitment import Report, Requests
 from service.adapters.pacs.configuration import Archive, PacsConfiguration
 from service.adapters.pacs.inbox import ARGUMENT, IMAGES, INBOX, OBJECT, quarantine
 from service.adapters.pacs.references import referenced_images
+from service.adapters.quiet import quiet
 from service.errors import ArchiveUnavailable
 from service.job_ports import BlobStore, Record
 from service.pacs_ports import PictureArchive, Retrieval

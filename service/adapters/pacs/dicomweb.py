@@ -9,8 +9,8 @@ import requests
 from dicomweb_client import DICOMwebClient
 from pydicom import Dataset
 
-from service.adapters.dicom.objects import quiet
 from service.adapters.pacs.configuration import Archive
+from service.adapters.quiet import quiet
 from service.errors import ArchiveRefused, ArchiveUnavailable
 from service.pacs_ports import Retrieval
 

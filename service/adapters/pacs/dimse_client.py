@@ -8,12 +8,12 @@ from typing import Any
 from pydicom import Dataset
 from pynetdicom import AE, build_role, evt
 
-from service.adapters.dicom.objects import quiet
 from service.adapters.pacs import sop_classes
 from service.adapters.pacs.configuration import Archive, MoveDestination, Tls
 from service.adapters.pacs.moved_images import receiving
 from service.adapters.pacs.prompt_sockets import PROMPT
 from service.adapters.pacs.tls import client_context, server_context
+from service.adapters.quiet import quiet
 from service.errors import ArchiveRefused, ArchiveUnavailable
 from service.pacs_ports import Retrieval
 

@@ -12,7 +12,6 @@ from pydicom import Dataset
 from pynetdicom import evt
 from pynetdicom.presentation import PresentationContext
 
-from service.adapters.dicom.objects import quiet
 from service.adapters.pacs import sop_classes
 from service.adapters.pacs.audit import AuditEntry, AuditEvent, AuditTrail, Outcome
 from service.adapters.pacs.commitment import Report, Reports
@@ -20,6 +19,7 @@ from service.adapters.pacs.configuration import Listener
 from service.adapters.pacs.listening import ListeningEntity
 from service.adapters.pacs.prompt_sockets import PROMPT
 from service.adapters.pacs.tls import server_context
+from service.adapters.quiet import quiet
 from service.pacs_ports import Disposition, ObjectReceiver
 
 #: Status of a C-STORE (PS3.4, GG.4-1).

@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+from dataclasses import replace
 
 import pytest
 
@@ -66,7 +67,7 @@ def with_an_unknown_method():
 )
 def test_what_is_no_whole_zip_is_refused(archive):
     with pytest.raises(InvalidParameter) as caught:
-        open_archive(io.BytesIO(archive))
+        open_archive(io.BytesIO(archive), LIMITS)
     assert caught.value.part == "archive"
 
 
@@ -114,3 +115,12 @@ def test_the_masks_of_a_folder_are_those_of_its_zip(tmp_path):
     zip_of_folder(tmp_path, target)
     found = [(mask.name, mask.content) for mask in masks_in(target, LIMITS)]
     assert found == [("a.nrrd", b"a.nrrd"), ("deep/b.nii", b"deep/b.nii")]
+
+
+def test_a_list_of_members_that_no_job_needs_is_not_even_read():
+    """Each of its entries would take ten times the room in memory."""
+    archive = bytearray(packed({f"{number}.txt": b"" for number in range(25_000)}, zipfile.ZIP_STORED))
+    with pytest.raises(TooLarge, match="list of members"):
+        open_archive(io.BytesIO(archive), LIMITS)
+    with open_archive(io.BytesIO(archive), replace(LIMITS, max_masks=10_000)) as opened:
+        assert len(opened.namelist()) == 25_000

@@ -107,6 +107,17 @@ def test_versions_stand_side_by_side_and_the_newest_has_the_plain_name(tmp_path)
         registry.get("hi@1.9.0")
 
 
+@pytest.mark.parametrize(
+    ("older", "newer"),
+    [("1.3.0-rc1", "1.3.0"), ("1.2.9", "1.3.0-rc1"), ("2025b", "2026a"), ("v2", "v10"), ("1.3.0", "1.3.0.post1")],
+)
+def test_what_comes_before_a_release_is_older_than_it(tmp_path, older, newer):
+    for order in ((older, newer), (newer, older)):
+        found = {name: versioned(version) for name, version in zip("xy", order, strict=True)}
+        registry = load_models([tmp_path / name for name in found], opener(found))
+        assert registry.get("hip").manifest.version == newer
+
+
 def test_models_are_found_again(tmp_path):
     found = {"x": versioned("1.0.0")}
     registry = ModelRegistry(

@@ -8,11 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.errors import InvalidParameter, TooLarge
+from model.inference.one_body import OCCUPIED
 from model.inference.surface import canonical_box
 from service import use_cases
 from service.errors import NotComputed
 from service.model_registry import ModelRegistry
 from tests.analytic_model import ellipsoid_model
+from tests.mask_stacks import stack_of
 from tests.service_parts import NAME, outcome_of
 
 PLENTY = 10**6
@@ -49,7 +51,7 @@ def test_volumes_share_grid_and_threshold(registry):
     for volume in (probability, labels, entropy):
         assert volume.grid is outcome.grid
         assert volume.array.shape == outcome.grid.shape
-    np.testing.assert_array_equal(labels.array == 1, probability.array >= use_cases.OCCUPIED)
+    np.testing.assert_array_equal(labels.array == 1, probability.array >= OCCUPIED)
     assert entropy.array.max() <= np.log(2) + 1e-6
 
 
@@ -100,3 +102,12 @@ def sized(outcome, size):
     answer = outcome.reconstruction
     fits = tuple(replace(fit, pose=replace(fit.pose, log_scale=-np.log(size))) for fit in answer.state.fits)
     return replace(outcome, reconstruction=replace(answer, state=replace(answer.state, fits=fits)))
+
+
+def test_the_masks_of_one_drawing_share_one_budget():
+    stack = stack_of(np.ones((10, 10, 10), bool))
+    read = lambda data, part, labels: (stack,)  # noqa: E731
+    assert len(use_cases.stacks_of(read, [b""] * 3, None, 3000)) == 3
+    with pytest.raises(TooLarge, match=r"up to mask\[2\]") as refused:
+        use_cases.stacks_of(read, [b""] * 8, None, 2999)
+    assert refused.value.part == "mask[2]"

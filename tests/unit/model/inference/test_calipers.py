@@ -85,6 +85,13 @@ def test_what_is_no_direction_is_refused_by_name(text):
         parse_extents(text)
 
 
+@pytest.mark.parametrize("number", ["1" * 3000, "1" * 3000 + ".", "." + "1" * 3000, "1e" + "1" * 3000])
+def test_a_long_text_that_is_nearly_a_direction_is_refused_as_fast_as_it_is_read(number):
+    """Where digits can be read in several ways, this would take hours."""
+    with pytest.raises(InvalidParameter, match="extents must hold"):
+        parse_extents(f"{number} {number} {number}x")
+
+
 def test_too_many_are_refused():
     with pytest.raises(InvalidParameter, match=str(MOST_EXTENTS)):
         parse_extents(",".join(f"1 0 {number}" for number in range(MOST_EXTENTS + 1)))

@@ -7,8 +7,9 @@ from contextlib import ExitStack
 import pytest
 from fastapi import Request
 
+from model.errors import TooLarge
 from service.errors import StoreFull, UnsupportedMediaType
-from service.routes.stow import IN_MEMORY, boundary_of, parts_of
+from service.routes.stow import IN_MEMORY, MOST_OBJECTS, boundary_of, parts_of
 from tests.small_disks import small_disk
 
 KIND = b'multipart/related; type="application/dicom"; boundary=b'
@@ -67,3 +68,10 @@ def test_a_compressed_body_is_refused():
     assert boundary_of(request_of()) == b"b"
     with pytest.raises(UnsupportedMediaType, match="Content-Encoding"):
         boundary_of(request_of(content_encoding=b"gzip"))
+
+
+def test_more_objects_than_a_request_may_hold_are_refused_before_they_are_kept():
+    with ExitStack() as kept:
+        assert len(parts_in(kept, body_of([b"1"] * MOST_OBJECTS))) == MOST_OBJECTS
+    with ExitStack() as kept, pytest.raises(TooLarge, match=str(MOST_OBJECTS)):
+        parts_in(kept, body_of([b""] * (MOST_OBJECTS + 1)))

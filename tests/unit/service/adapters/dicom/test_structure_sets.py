@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from pydicom.sequence import Sequence as Items
 from pydicom.uid import generate_uid
 
-from model.errors import InvalidGeometry, InvalidMask, InvalidParameter
+from model.errors import InvalidGeometry, InvalidMask, InvalidParameter, TooLarge
+from service.adapters.dicom import contours, planes
 from service.adapters.dicom.masks import drawn_labels, frame_of_reference, referenced_series, stacks_of_object
 from service.adapters.dicom.series import series_of
 from service.adapters.images import ImageLimits
@@ -269,3 +270,30 @@ def test_a_drawing_in_another_frame_of_reference_than_the_images_is_refused(imag
     assert stacks_of_object(found, "mask[0]", LIMITS)
     delattr(holder, name)
     assert stacks_of_object(found, "mask[0]", LIMITS, home=home)[0].grid.coincides_with(home)
+
+
+def test_a_drawing_in_more_directions_than_are_accepted_is_refused(images, monkeypatch):
+    turns = np.linspace(0.0, np.pi, 21, endpoint=False)
+    corners = np.array([[-9.0, -9.0], [9.0, -9.0], [9.0, 9.0], [-9.0, 9.0]])
+    drawn = [
+        ("CLOSED_PLANAR", corners @ np.array([[np.cos(turn), np.sin(turn), 0.0], [0.0, 0.0, 1.0]])) for turn in turns
+    ]
+    found, roomy = reread(rtstruct_of(images, drawn)), ImageLimits(max_bytes=1 << 24, max_voxels=1 << 26)
+    monkeypatch.setattr(planes, "MOST_GROUPS", 21)
+    assert len(stacks_of_object(found, "mask[0]", roomy)) == 21
+    monkeypatch.setattr(planes, "MOST_GROUPS", 20)
+    with pytest.raises(TooLarge, match="more than 20 directions"):
+        stacks_of_object(found, "mask[0]", roomy)
+
+
+@pytest.mark.parametrize(("name", "most"), [("MOST_CONTOURS", 1), ("MOST_POINTS", 7)])
+def test_more_contours_or_points_than_are_accepted_are_refused(images, monkeypatch, name, most):
+    found = reread(rtstruct_of(images, [("CLOSED_PLANAR", square(images, radius)) for radius in (3.0, 7.0)]))
+    monkeypatch.setattr(contours, name, most + 1)
+    assert len(stacks_of_object(found, "mask[0]", LIMITS)) == 1
+    monkeypatch.setattr(contours, name, most)
+    with pytest.raises(TooLarge, match="choose regions"):
+        stacks_of_object(found, "mask[0]", LIMITS)
+    monkeypatch.setattr(contours, name, 0)
+    with pytest.raises(TooLarge, match="choose regions"):
+        drawn_labels(found, "mask[0]")
