@@ -156,7 +156,18 @@ def _refusal(info: zipfile.ZipInfo, limits: ArchiveLimits) -> InputError | None:
     return None
 
 
+def left_out(archive: BinaryIO, limits: ArchiveLimits) -> list[str]:
+    """Names of the files that are taken for no masks, but for hidden ones, in their order."""
+    with open_archive(archive, limits) as opened:
+        return sorted(info.filename for info in opened.infolist() if _is_shown(info) and not _is_mask(info))
+
+
 def _is_mask(info: zipfile.ZipInfo) -> bool:
-    path = PurePosixPath(info.filename)
-    hidden = any(part.startswith((".", "__MACOSX")) for part in path.parts)
-    return not info.is_dir() and not hidden and path.name.lower().endswith(MASK_SUFFIXES)
+    """By the end of its name; objects of DICOM often have names without one."""
+    name = PurePosixPath(info.filename).name
+    return _is_shown(info) and (name.lower().endswith(MASK_SUFFIXES) or "." not in name)
+
+
+def _is_shown(info: zipfile.ZipInfo) -> bool:
+    hidden = any(part.startswith((".", "__MACOSX")) for part in PurePosixPath(info.filename).parts)
+    return not info.is_dir() and not hidden

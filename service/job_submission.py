@@ -20,6 +20,8 @@ from service.job_ports import BlobStore, JobEngine, JobStatus
 _PIECE = 1 << 20
 #: Member of a job's argument: SHA-256 of everything that was asked for.
 _FINGERPRINT = "fingerprint"
+#: A key is one client's for requests of all kinds.
+_ANY_KIND = "request"
 #: Member of a job's argument: whose inputs are the job's. Empty where no other request can want the same job, and not
 #: there in records of earlier releases.
 SUBMISSION = "submission"
@@ -60,7 +62,7 @@ class JobDesk:
         """
         if (earlier := self.earlier(kind, asked, inputs, key)) is not None:
             return earlier
-        fingerprint, identifier = _fingerprint(asked, inputs), self.jobs.new_id(kind, key)
+        fingerprint, identifier = _fingerprint(kind, asked, inputs), self.jobs.new_id(_ANY_KIND, key)
         if self.jobs.unfinished() >= self.max_jobs:
             raise Overloaded("As many jobs wait as this service accepts; send the request again later.")
         submission = "" if key is None else uuid.uuid4().hex
@@ -83,8 +85,8 @@ class JobDesk:
         Raises:
             InvalidParameter: the key has made a job for another request.
         """
-        found = None if key is None else self._found(self.jobs.new_id(kind, key))
-        return None if found is None else _of_same_request(found, _fingerprint(asked, inputs))
+        found = None if key is None else self._found(self.jobs.new_id(_ANY_KIND, key))
+        return None if found is None else _of_same_request(found, _fingerprint(kind, asked, inputs))
 
     def _found(self, identifier: str) -> JobStatus | None:
         try:
@@ -132,8 +134,8 @@ def _of_same_request(found: JobStatus, fingerprint: str) -> JobStatus:
     return found
 
 
-def _fingerprint(asked: Mapping[str, Any], inputs: Sequence[BinaryIO]) -> str:
-    digest = hashlib.sha256(json.dumps(asked, sort_keys=True).encode())
+def _fingerprint(kind: str, asked: Mapping[str, Any], inputs: Sequence[BinaryIO]) -> str:
+    digest = hashlib.sha256(json.dumps([kind, asked], sort_keys=True).encode())
     for file in inputs:
         digest.update(_digest(file))
     return digest.hexdigest()

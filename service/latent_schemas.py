@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from service.ports import MeshFormat
 from service.request_schemas import SpacingMm
@@ -17,7 +17,9 @@ class InterpolationQuery(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    other: str = Field(alias="with", description="identifier of the other result, of the same model")
+    other: Annotated[str, AfterValidator(str.lower)] = Field(
+        alias="with", description="identifier of the other result, of the same model"
+    )
     at: Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)] | None = Field(
         None, description="0 is the first shape, 1 the other; 0.5 when left out"
     )

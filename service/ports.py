@@ -163,6 +163,10 @@ class Ticket(Protocol):
         """Result of the work, done by one of the engine's workers."""
         ...
 
+    def aside(self) -> AbstractContextManager[None]:
+        """While a client takes what was made, its place is another's; then it has one again, even one too many."""
+        ...
+
 
 class ModeSource(Protocol):
     """Modes of a model, found once."""

@@ -187,19 +187,38 @@ def parse_annotated(text: str) -> AnnotatedRule | tuple[Plane, ...]:
         case "auto" | "all" | "nonempty" as rule:
             return rule
     try:
-        planes = [_AskedPlane.model_validate(item, strict=True) for item in json.loads(text)]
-    except (ValueError, TypeError, RecursionError, ValidationError):
-        planes = []
-    if not planes:
+        items = json.loads(text, object_pairs_hook=_once)
+    except (ValueError, RecursionError):
+        items = None
+    if not isinstance(items, list) or not items:
         accepted = 'auto, all, nonempty or a JSON list of planes such as [{"stack": 0, "axis": 2, "index": 7}]'
         raise InvalidParameter(f"The parameter annotated must be {accepted}.", part="annotated")
-    named = tuple(Plane(plane.stack, plane.axis, plane.index) for plane in planes)
+    named = tuple(_named_plane(item, f"annotated[{number}]") for number, item in enumerate(items))
     if (count := len(set(named))) > MOST_PLANES:
         raise InvalidParameter(
             f"The parameter annotated names {count} different planes; at most {MOST_PLANES} are accepted.",
             part="annotated",
         )
     return named
+
+
+def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    """Members of an object of JSON, none of them twice."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a member stands twice")
+    return found
+
+
+def _named_plane(item: object, part: str) -> Plane:
+    try:
+        plane = _AskedPlane.model_validate(item, strict=True)
+    except ValidationError:
+        raise InvalidParameter(
+            f"{part} is no plane; an object with axis (0 to 2), index (from 0) and perhaps stack (from 0) is accepted.",
+            part=part,
+        ) from None
+    return Plane(plane.stack, plane.axis, plane.index)
 
 
 def parse_labels(texts: list[str]) -> frozenset[int] | None:

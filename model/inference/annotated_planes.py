@@ -9,8 +9,9 @@ from jaxtyping import Float
 
 from model.errors import InconsistentStacks, InvalidMask, InvalidParameter
 from model.geometry import Grid
-from model.inference.mask_stack import MaskStack, Plane, box_corners, index_box, occupied, section_of, world_box
+from model.inference.mask_stack import MaskStack, Plane, index_box, occupied, section_of, world_box
 from model.inference.plane_cover import cover_planes
+from model.inference.repeats import looked_at, repeats
 from model.inference.stacks import EXCLUDED_VALUE
 
 AnnotatedRule = Literal["auto", "all", "nonempty"]
@@ -28,8 +29,9 @@ def find_planes(
 
     ``all`` takes every plane along the axis of the largest spacing, ``nonempty`` those of them that hold
     foreground, ``auto`` the fewest planes along any axes that together hold all foreground
-    (`model.inference.plane_cover`). A stack of a single slice has that one alone. Each stack is judged by itself;
-    planes are counted over all of them, those that show the same place once (`lie_apart`).
+    (`model.inference.plane_cover`). A stack of a single slice has that one alone. Each stack is judged by itself.
+    Where a plane of one stack shows the place of another's, the first one counts (`repeat_warnings`): a drawing that
+    is sent twice knows no more than one. At least two planes have to show different places (`lie_apart`).
     Planes without foreground are annotated by ``all`` and by name only: between two drawn slices of a
     sparse stack nobody has looked.
 
@@ -47,17 +49,39 @@ def find_planes(
         InconsistentStacks: the foreground of some stacks over `gap_mm` from that of all others.
     """
     _check_same_world(stacks, gap_mm)
-    if isinstance(rule, str):
-        planes = tuple(
-            Plane(number, axis, index)
-            for number, stack in enumerate(stacks)
-            for axis, index in sorted(_planes_by_rule(stack, rule))
-        )
-        _check_count(stacks, planes)
-    else:
-        planes = _named_planes(stacks, rule)
+    planes = _all_planes(stacks, rule)
+    again = repeats(stacks, planes)
+    planes = tuple(plane for plane in planes if plane not in again)
     if not any(section_of(stacks[p.stack].foreground, p).any() for p in planes):
         raise InvalidMask("mask holds no foreground on its annotated planes; at least one voxel is needed", part="mask")
+    return planes
+
+
+def repeat_warnings(
+    stacks: Sequence[MaskStack], rule: AnnotatedRule | Sequence[Plane], counted: Sequence[Plane]
+) -> tuple[str, ...]:
+    """What to tell about planes that do not count because an earlier stack shows their places.
+
+    Args:
+        counted: by the same rule.
+    """
+    repeated = [plane.stack for plane in _all_planes(stacks, rule) if plane not in counted] if len(stacks) > 1 else []
+    return tuple(
+        f"{stacks[number].part} shows {repeated.count(number)} plane(s) that an earlier mask shows too; the first "
+        "drawing of a place counts."
+        for number in sorted(set(repeated))
+    )
+
+
+def _all_planes(stacks: Sequence[MaskStack], rule: AnnotatedRule | Sequence[Plane]) -> tuple[Plane, ...]:
+    if not isinstance(rule, str):
+        return _named_planes(stacks, rule)
+    planes = tuple(
+        Plane(number, axis, index)
+        for number, stack in enumerate(stacks)
+        for axis, index in sorted(_planes_by_rule(stack, rule))
+    )
+    _check_count(stacks, planes)
     return planes
 
 
@@ -110,15 +134,8 @@ def _shows_no_more(stacks: Sequence[MaskStack], first: Plane, second: Plane) -> 
 def _farthest_mm(stacks: Sequence[MaskStack], shown: Plane, other: Plane) -> float:
     """How far what was looked at on a plane reaches from another plane."""
     grid = stacks[other.stack].grid
-    index = grid.to_index(_looked_at(stacks[shown.stack], shown))[:, other.axis]
+    index = grid.to_index(looked_at(stacks[shown.stack], shown))[:, other.axis]
     return float(np.abs(index - other.index).max() * grid.spacing[other.axis])
-
-
-def _looked_at(stack: MaskStack, plane: Plane) -> Float[np.ndarray, "8 3"]:
-    """World corners of the box around the voxels of a plane that were looked at."""
-    low, high = index_box(~np.take(stack.excluded, [plane.index], axis=plane.axis))
-    low[plane.axis] = high[plane.axis] = plane.index
-    return stack.grid.to_world(box_corners(low, high))
 
 
 def check_stacks(named: Sequence[Plane], count: int) -> None:

@@ -19,6 +19,7 @@ class MaskStack:
         foreground: (i, j, k) voxels of the object.
         excluded: (i, j, k) voxels that were never looked at (value 255), whatever the planes say.
         space: world in which answers about this volume are told; its grid is RAS all the same.
+        absent: labels of the object that it does not hold, though it holds others.
         notes: sentences that answers about it must tell, for example of what its file left open.
     """
 
@@ -27,6 +28,7 @@ class MaskStack:
     foreground: Bool[np.ndarray, "i j k"]
     excluded: Bool[np.ndarray, "i j k"]
     space: Space = "RAS"
+    absent: frozenset[int] = frozenset()
     notes: tuple[str, ...] = ()
 
 

@@ -14,6 +14,7 @@ from model.bundle import ShapeModel
 from model.errors import InvalidMask, InvalidParameter
 from model.geometry import Space
 from model.inference.agreement import disagreeing_planes, plane_warnings, sections_of
+from model.inference.annotated_planes import repeat_warnings
 from model.inference.calipers import USUAL_EXTENTS, Extent, direction_of, measure_extents
 from model.inference.coverage import coverage_warnings
 from model.inference.discrepancy.conditioning import DiscrepancyPrior, corrected, discrepancy_prior, observed_anew
@@ -202,7 +203,8 @@ def reconstruct(
         extents=measure_extents(mesh, spread, options.extents, space),
         log_prior_density=density,
         typicality_percentile=percentile,
-        warnings=_warnings(found, options)
+        warnings=repeat_warnings(stacks, options.annotated, planes)
+        + _warnings(found, options)
         + separate_warnings(observations, logits, mesh)
         + rival_warnings(found)
         + typicality_warnings(model, percentile)

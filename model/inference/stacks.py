@@ -25,7 +25,8 @@ ROUNDING_TOLERANCE = 1e-4
 LABEL_LIMIT = 256
 #: Labels listed in a message, at most.
 LISTED_LABELS = 12
-#: An object that is this many times as long as the model's box has its voxels in another unit.
+#: An object that is this many times as long as the model's box has its voxels in another unit; shorter by the square
+#: of it, too.
 UNIT_FACTOR = 10.0
 
 
@@ -57,7 +58,8 @@ def make_stack(
     excluded = integers == EXCLUDED_VALUE
     foreground = (integers != 0) & ~excluded if labels is None else np.isin(integers, sorted(labels))
     grid = Grid((volume.shape[0], volume.shape[1], volume.shape[2]), grid_affine)
-    return MaskStack(part, grid, foreground, excluded)
+    absent = frozenset[int]() if labels is None else labels - frozenset(int(label) for label in present)
+    return MaskStack(part, grid, foreground, excluded, absent=absent)
 
 
 def checked_labels(labels: frozenset[int] | None) -> None:
@@ -77,24 +79,45 @@ def checked_labels(labels: frozenset[int] | None) -> None:
         raise InvalidParameter("label must name at least one value, and positive integers only", part="label")
 
 
+def require_labels(stacks: Sequence[MaskStack]) -> None:
+    """Refuse labels of the object that none of its stacks holds: `InvalidMask`."""
+    absent = frozenset[int].intersection(*(stack.absent for stack in stacks)) if stacks else frozenset[int]()
+    if absent:
+        part = stacks[0].part if len(stacks) == 1 else "mask"
+        raise InvalidMask(
+            f"{part} does not hold label {_listed(sorted(absent))}; labels that are there are accepted", part=part
+        )
+
+
 def require_length(stacks: Sequence[MaskStack], longest_mm: float) -> None:
-    """Refuse an object so long that its voxels cannot be in mm.
+    """Refuse an object so long, or so short, that its voxels cannot be in mm.
 
     Args:
         longest_mm: that an object can be, the longest side of the model's box.
 
     Raises:
-        InvalidMask: over `UNIT_FACTOR` times as long along an axis of its grid.
+        InvalidMask: over `UNIT_FACTOR` times as long along an axis of its grid, or on no stack the square of that
+            part as long.
     """
-    for stack in stacks:
-        low, high = index_box(stack.foreground)
-        length_mm = float(((high - low + 1) * stack.grid.spacing).max())
+    lengths_mm = [_length_mm(stack) for stack in stacks]
+    if max(lengths_mm) * UNIT_FACTOR**2 < longest_mm:
+        raise InvalidMask(
+            f"{stacks[0].part} holds an object {max(lengths_mm):.2g} mm long, and the model's are up to "
+            f"{longest_mm:.0f} mm; a mask of one of them, whose voxel spacing is in mm, is accepted",
+            part=stacks[0].part,
+        )
+    for stack, length_mm in zip(stacks, lengths_mm, strict=True):
         if length_mm > UNIT_FACTOR * longest_mm:
             raise InvalidMask(
                 f"{stack.part} holds an object {length_mm:.0f} mm long, and the model's are at most "
                 f"{longest_mm:.0f} mm; a mask of one of them, whose voxel spacing is in mm, is accepted",
                 part=stack.part,
             )
+
+
+def _length_mm(stack: MaskStack) -> float:
+    low, high = index_box(stack.foreground)
+    return float(((high - low + 1) * stack.grid.spacing).max())
 
 
 def checked_affine(part: str, affine: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

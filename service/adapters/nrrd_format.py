@@ -167,7 +167,11 @@ def _values(
     kind = _voxel_type(fields, part)
     encoding = ENCODINGS.get(str(fields.get("encoding")).lower())
     skips = [fields.get(key, 0) for key in ("line skip", "lineskip", "byte skip", "byteskip")]
-    if encoding is None or any(skips):
+    if any(skips):
+        raise UnreadableImage(
+            f"{part} skips bytes or lines before its voxels; NRRD without skips is accepted", part=part
+        )
+    if encoding is None:
         raise UnreadableImage(f"{part} has an unknown NRRD encoding; raw, gzip and bzip2 are accepted", part=part)
     return read_voxels(file, Stored(encoding, kind, shape), part, limits)
 

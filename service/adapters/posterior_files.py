@@ -41,6 +41,7 @@ class PosteriorWriter:
             "model": named_model(posterior.outcome),
             "reconstruction": identifier,
             "uncertainty": posterior.outcome.options.uncertainty,
+            **({"members": members} if (members := len(posterior.outcome.reconstruction.state.members)) else {}),
             "space": _space(posterior),
             "unit": "mm",
             "format": self._format.value,

@@ -31,6 +31,15 @@ class _Ticket:
             if future.done():
                 self._pending.discard(future)
 
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """See `service.ports.Ticket`."""
+        self._pool.release()
+        try:
+            yield
+        finally:
+            self._pool.take()
+
     def leave(self) -> None:
         """Free the place, now or as soon as the last thread that still works for it is done."""
         left = list(self._pending)
@@ -78,6 +87,11 @@ class WorkerPool:
     def submit(self, work: Callable[[], T]) -> Future[T]:
         """Queue work for the next free thread."""
         return self._executor.submit(self._counted, work)
+
+    def take(self) -> None:
+        """Take one place, whether or not there is one."""
+        with self._lock:
+            self._admitted += 1
 
     def release(self) -> None:
         """Give one place back."""

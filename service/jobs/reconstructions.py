@@ -6,7 +6,7 @@ import json
 from model.errors import InputError, InvalidParameter
 from service import use_cases
 from service.errors import kind_of
-from service.job_archives import MASK_SUFFIXES, masks_in
+from service.job_archives import MASK_SUFFIXES, left_out, masks_in
 from service.job_files import JobFiles
 from service.job_ports import Check, JobKind, JobRun, Record
 from service.job_submission import SUBMISSION
@@ -71,8 +71,8 @@ def _unpack(tools: JobTools, item: Record, check: Check) -> Record:
             f"The archive must hold masks; they end with {', '.join(MASK_SUFFIXES)}.", part="archive"
         )
     files.put_note("names", {"names": names})
-    model = tools.registry.names()
-    files.put_note("manifest", {"kind": RECONSTRUCTIONS_JOB, "unit": "mm", "models": list(model)})
+    known = {"kind": RECONSTRUCTIONS_JOB, "unit": "mm", "models": [item["model"]]}
+    files.put_note("manifest", {**known, "left_out": left_out(archive, tools.archive_limits)})
     return {"count": len(names), **_noted(files, item)}
 
 

@@ -1,12 +1,13 @@
 """ZIP archives that stream while they are made, and whose work ends with the stream."""
 
+import asyncio
 from collections.abc import AsyncGenerator, Callable, Iterable
-from contextlib import aclosing
+from contextlib import aclosing, suppress
 from functools import partial
 from typing import Any
 
 from starlette.responses import StreamingResponse
-from starlette.types import Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 from zipstream import ZipStream  # type: ignore[import-untyped]
 
 from model.interruption import Check
@@ -19,10 +20,19 @@ from service.routes.responses import ZIP, attachment
 MakeFile = Callable[[Check], SampleFile]
 
 
+#: A client that takes nothing for so long (s) is taken for gone.
+STALLED_S = 120.0
+
+
+class _Stalled(Exception):
+    """The client takes nothing any more."""
+
+
 class ArchiveResponse(StreamingResponse):
     """An archive with a manifest as its last member.
 
     Args:
+        ticket: its place is another's while the client takes what was made, however slowly.
         works: make the files in their order, some of them ahead of what was sent; one without data is an entry alone.
         manifest: makes the manifest of the files' entries.
         ahead: how many are begun or wait to be sent.
@@ -36,13 +46,23 @@ class ArchiveResponse(StreamingResponse):
         manifest: Callable[[list[dict[str, Any]]], bytes],
         ahead: int,
     ) -> None:
+        self._ticket = ticket
         self._chunks = _chunks(ticket, works, manifest, ahead)
         super().__init__(self._chunks, media_type=ZIP, headers=attachment(name))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send it; once the client is gone nothing of it is made any more."""
+
+        async def sent(message: Message) -> None:
+            with self._ticket.aside():
+                try:
+                    await asyncio.wait_for(send(message), STALLED_S)
+                except TimeoutError:
+                    raise _Stalled from None
+
         async with aclosing(self._chunks):
-            await super().__call__(scope, receive, send)
+            with suppress(_Stalled):  # the server ends the connection, as what was begun is not whole
+                await super().__call__(scope, receive, sent)
 
 
 async def _chunks(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Path, Request
+from pydantic import AfterValidator
 
 from model.bundle import ShapeModel
 from service.errors import UnknownResult
@@ -66,7 +67,7 @@ def client_of(request: Request) -> str | None:
 
 
 async def admitted(services: Annotated[Services, Depends(services_of)]) -> AsyncIterator[Ticket]:
-    """A place among running and waiting work, until the answer has been sent."""
+    """A place among running and waiting work."""
     with services.engine.admit() as ticket:
         yield ticket
 
@@ -77,11 +78,15 @@ def model_in_path(model: str, services: Annotated[Services, Depends(services_of)
 
 
 WithServices = Annotated[Services, Depends(services_of)]
-WithTicket = Annotated[Ticket, Depends(admitted)]
+#: Until the answer is made, and until it has been sent; work of the latter kind goes on meanwhile.
+WithTicket = Annotated[Ticket, Depends(admitted, scope="function")]
+WithStreamTicket = Annotated[Ticket, Depends(admitted, scope="request")]
 WithModel = Annotated[ShapeModel, Depends(model_in_path)]
 #: The identifier of a result in a path.
 ResultId = Annotated[
-    str, Path(alias="id", description="identifier of the result", json_schema_extra={"format": "uuid"})
+    str,
+    Path(alias="id", description="identifier of the result", json_schema_extra={"format": "uuid"}),
+    AfterValidator(str.lower),
 ]
 
 

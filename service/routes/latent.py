@@ -19,7 +19,14 @@ from service.ports import Outcome
 from service.provenance import metadata_of
 from service.routes.archives import ArchiveResponse, MakeFile
 from service.routes.connection import run_while_connected
-from service.routes.dependencies import ResultId, Services, WithServices, WithTicket, result_of_parameter
+from service.routes.dependencies import (
+    ResultId,
+    Services,
+    WithServices,
+    WithStreamTicket,
+    WithTicket,
+    result_of_parameter,
+)
 from service.routes.reconstructions import PATH
 from service.routes.responses import MESH_MEDIA_TYPES, ZIP, attachment, files, problems
 from service.routes.strict import StrictRoute
@@ -66,7 +73,7 @@ async def read_interpolation(
     query: Annotated[InterpolationQuery, Query()],
     request: Request,
     services: WithServices,
-    ticket: WithTicket,
+    ticket: WithStreamTicket,
 ) -> Response:
     """The straight line in the flow's base, by the model alone, in the world of the first."""
     if query.at is not None and query.steps is not None:

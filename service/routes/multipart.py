@@ -61,7 +61,9 @@ async def read_form(request: Request, most_files: int) -> FormData:
         return await request.form(max_files=most_files + 1, max_fields=MOST_FIELDS)
     except HTTPException as fault:
         if str(fault.detail).startswith(TOO_MANY_FILES):
-            raise TooLarge(f"At most {most_files} parts named mask are accepted.", part="mask") from fault
+            raise TooLarge(
+                f"At most {most_files} files are accepted, each in a part named mask.", part="mask"
+            ) from fault
         raise
     except ClientDisconnect:
         raise Abandoned("The client went away before its request was read.") from None

@@ -15,7 +15,7 @@ from service.presentation import next_plane_summary
 from service.request_schemas import NextPlaneQuery, PosteriorQuery
 from service.routes.archives import ArchiveResponse
 from service.routes.connection import run_while_connected
-from service.routes.dependencies import ResultId, WithServices, WithTicket
+from service.routes.dependencies import ResultId, WithServices, WithStreamTicket, WithTicket
 from service.routes.reconstructions import PATH
 from service.routes.responses import ZIP, files, problems
 from service.routes.strict import StrictRoute
@@ -48,7 +48,7 @@ def posterior_router() -> APIRouter:
 
 
 async def read_posterior(
-    identifier: ResultId, query: Annotated[PosteriorQuery, Query()], services: WithServices, ticket: WithTicket
+    identifier: ResultId, query: Annotated[PosteriorQuery, Query()], services: WithServices, ticket: WithStreamTicket
 ) -> Response:
     """Draws of code, pose and discrepancy; of an ensemble its members. Item i is the shape of `seed` + i."""
     limits = services.settings

@@ -195,7 +195,10 @@ def _sentence(fault: dict[str, Any]) -> tuple[str, str]:
         case "missing":
             return part, f"The parameter {part} is missing."
         case "value_error" if "UploadFile" in fault["msg"]:
-            return part, f"The part {part} must be a file; with curl: -F {names[0]}=@FILE."
+            return (
+                part,
+                f"The part {part} must be a file, sent with filename=; with curl: -F {names[0]}=@FILE.",
+            )
         case _ if isinstance(fault.get("input"), UploadFile):
             return part, f"The part {part} must be text, no file; with curl: -F {names[0]}=VALUE."
         case _:

@@ -15,7 +15,7 @@ from service.request_schemas import BatchQuery, SampleQuery, Seed
 from service.routes.archives import ArchiveResponse
 from service.routes.caching import CONDITIONAL, cached, caching_headers, confirmed, is_held, not_modified
 from service.routes.connection import run_while_connected
-from service.routes.dependencies import Services, WithModel, WithServices, WithTicket
+from service.routes.dependencies import Services, WithModel, WithServices, WithStreamTicket
 from service.routes.models import PATH
 from service.routes.responses import ZIP, attachment, files, problems, sample_media_type
 from service.routes.strict import StrictRoute
@@ -76,7 +76,7 @@ async def read_sample(
 
 
 async def read_batch(
-    query: Annotated[BatchQuery, Query()], model: WithModel, services: WithServices, ticket: WithTicket
+    query: Annotated[BatchQuery, Query()], model: WithModel, services: WithServices, ticket: WithStreamTicket
 ) -> Response:
     """Item i is the shape of `seed` + i, the same as on its own; the manifest comes last.
 

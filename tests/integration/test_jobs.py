@@ -112,6 +112,9 @@ def test_the_same_key_leads_to_the_same_job_and_another_request_is_refused(clien
     assert first["id"] == again["id"]
     other = client.post(JOBS, files=form(kind="samples", count=3), headers=key)
     assert (other.status_code, other.json()["part"]) == (422, "Idempotency-Key")
+    wish = {**key, "Prefer": "respond-async"}
+    other = client.post("/v1/reconstructions", files=mask_parts(), data={"model": NAME}, headers=wish)
+    assert problem(other, 422)["part"] == "Idempotency-Key"
 
 
 def test_events_tell_the_progress_to_the_end(client):
@@ -235,11 +238,10 @@ def test_a_job_whose_files_are_gone_leads_nowhere(client, app):
 
 
 def test_a_request_sent_again_is_answered_with_its_job_though_its_model_is_gone(tmp_path):
-    key = {"Idempotency-Key": "one"}
-
     def sent(client):
+        key = {"Idempotency-Key": "one"}
         samples = client.post(JOBS, files=form(kind="samples", count=2, model=NAME), headers=key)
-        wish = {**key, "Prefer": "respond-async"}
+        wish = {"Idempotency-Key": "two", "Prefer": "respond-async"}
         single = client.post("/v1/reconstructions", files=mask_parts(), data={"model": NAME}, headers=wish)
         return [(answer.status_code, answer.headers["location"]) for answer in (samples, single)]
 

@@ -5,10 +5,13 @@ import socket
 import threading
 import time
 import uuid
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import pytest
 
+from service.routes import archives
 from tests.analytic_model import EllipsoidDecoder, ellipsoid_model
 from tests.service_parts import NAME, app_for, mask_bytes, mask_parts, problem, running
 
@@ -133,3 +136,22 @@ def test_fewer_triangles_wait_for_a_place_and_the_kept_surface_does_not(client, 
         decoder.gate.set()
     until(lambda: client.get("/readyz").status_code == 200)
     assert client.get(made["links"]["mesh"], params={"max_error_mm": 0.2}).status_code == 200
+
+
+def test_clients_that_do_not_read_hold_no_place(tmp_path, monkeypatch):
+    monkeypatch.setattr(archives, "STALLED_S", 2.0)
+    path = f"GET /v1/models/{NAME}/samples?count=60&format=obj HTTP/1.1\r\nHost: here\r\n\r\n"
+    with running(app_for(tmp_path, workers=1, max_waiting=1, max_samples=60)) as client, ExitStack() as held:
+        begun = []
+        while len(begun) < 4:
+            slow = held.enter_context(socket.socket())
+            slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            slow.settimeout(20.0)
+            slow.connect((client.base_url.host, client.base_url.port))
+            slow.sendall(path.encode())
+            if slow.recv(12, socket.MSG_PEEK) == b"HTTP/1.1 200":  # else others are still busy filling their buffers
+                begun.append(slow)
+        until(lambda: client.post(RECONSTRUCTIONS, files=mask_parts()).status_code == 201)
+        time.sleep(3.0)
+        for slow in begun:
+            assert b"manifest.json" not in b"".join(iter(partial(slow.recv, 1 << 16), b""))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from model.errors import InvalidParameter, TooLarge
-from service.job_archives import ArchiveLimits, masks_in, open_archive, zip_of_folder
+from service.job_archives import ArchiveLimits, left_out, masks_in, open_archive, zip_of_folder
 
 LIMITS = ArchiveLimits(max_masks=10, max_mask_bytes=10_000, max_bytes=25_000)
 MASKS = {"a.nii": b"a" * 5000, "b.nii": b"b" * 5000, "c.nii.gz": b"c"}
@@ -124,3 +124,9 @@ def test_a_list_of_members_that_no_job_needs_is_not_even_read():
         open_archive(io.BytesIO(archive), LIMITS)
     with open_archive(io.BytesIO(archive), replace(LIMITS, max_masks=10_000)) as opened:
         assert len(opened.namelist()) == 25_000
+
+
+def test_files_that_are_no_masks_are_told_and_objects_without_a_suffix_are_masks():
+    archive = io.BytesIO(packed({**MASKS, "study/IM0001": b"d", "notes.txt": b"n", ".hidden": b"h", "x.seg": b"s"}))
+    assert [mask.name for mask in masks_in(archive, LIMITS)] == [*MASKS, "study/IM0001"]
+    assert left_out(archive, LIMITS) == ["notes.txt", "x.seg"]

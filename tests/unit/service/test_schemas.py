@@ -32,6 +32,22 @@ def test_a_plane_without_its_stack_is_of_the_first(chosen):
     assert parse_annotated(text) == tuple(Plane(0, p.axis, p.index) for p in chosen)
 
 
+@pytest.mark.parametrize(
+    "item",
+    [{"axis": 3, "index": 1}, {"axis": 0, "index": -1}, {"axis": 0, "index": 15.5}, {"axis": 0, "index": "15"}, {}, 7],
+)
+def test_an_entry_that_is_no_plane_is_named(item):
+    planes = [{"axis": 0, "index": 15}, item, {"axis": 1, "index": 36}]
+    with pytest.raises(InvalidParameter, match=r"annotated\[1\] is no plane") as caught:
+        parse_annotated(json.dumps(planes))
+    assert caught.value.part == "annotated[1]"
+
+
+def test_a_member_that_stands_twice_is_refused():
+    with pytest.raises(InvalidParameter):
+        parse_annotated('[{"axis": 0, "index": 15, "axis": 1}, {"axis": 1, "index": 36}]')
+
+
 @given(st.text())
 def test_any_other_text_is_refused_in_a_sentence(text):
     assume(text.strip() not in ("auto", "all", "nonempty"))

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from model.errors import InconsistentStacks, InvalidMask, InvalidParameter
 from model.geometry import Grid
+from model.inference.annotated_planes import repeat_warnings
 from model.inference.observations import MaskStack, Plane, find_planes
 from tests.mask_stacks import SHAPE, centres, cut, ellipsoid, found, held, semi_axes, stack_of
 
@@ -32,7 +33,7 @@ def test_auto_finds_every_nth_slice(radii, centre, axis, step, data):
 
 @given(semi_axes, centres, st.integers(0, 2), st.integers(-5, 4), st.integers(1, 5))
 def test_auto_finds_two_parallel_slices(radii, centre, axis, first, gap):
-    drawn = [(axis, round(centre[axis]) + first), (axis, min(round(centre[axis]) + first + gap, 18))]
+    drawn = [(axis, round(centre[axis]) + first), (axis, min(round(centre[axis]) + first + gap, 19))]
     solid = ellipsoid(tuple(np.maximum(radii, 8.0)), centre)
     assert found(cut(solid, drawn)) == drawn
 
@@ -229,10 +230,10 @@ def test_slices_that_are_farther_apart_or_turned_are_two():
     assert len(find_planes([one, turned(one, (20, 0, 0))], "auto")) == 2
 
 
-def test_a_slice_sent_twice_beside_others_stays():
+def test_a_slice_sent_twice_beside_others_counts_once():
     one = stack_of(cut(ellipsoid(), [(2, 12)]))
     two = stack_of(cut(ellipsoid(), [(2, 12), (2, 16)]), part="mask[1]")
-    assert find_planes([one, two], "auto") == (Plane(0, 2, 12), Plane(1, 2, 12), Plane(1, 2, 16))
+    assert find_planes([one, two], "auto") == (Plane(0, 2, 12), Plane(1, 2, 16))
 
 
 def test_named_planes_without_foreground():
@@ -240,7 +241,7 @@ def test_named_planes_without_foreground():
         find_planes([stack_of(ellipsoid())], [Plane(0, 2, 0), Plane(0, 2, 1)])
 
 
-@pytest.mark.parametrize("gap", [0.0, 19.0, 21.0, 500.0])
+@pytest.mark.parametrize("gap", [1.0, 19.0, 21.0, 500.0])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_stacks_must_lie_in_one_place(gap, axis):
     solid = cut(ellipsoid(), [(2, 8), (2, 16)])
@@ -263,3 +264,50 @@ def test_stacks_may_be_near_each_other_through_others(order):
     assert len(find_planes(parts, [Plane(number, 2, 12) for number in range(3)], 20.0)) == 3
     with pytest.raises(InconsistentStacks):
         find_planes(ends, [Plane(0, 2, 12), Plane(1, 2, 12)], 20.0)
+
+
+class TestRepeats:
+    """A drawing that is sent twice knows no more than one."""
+
+    PLANES = ((0, 14), (1, 16), (2, 12))
+    DRAWN = stack_of(cut(ellipsoid(), PLANES))
+
+    def test_a_place_counts_once(self):
+        once = find_planes([self.DRAWN], "auto")
+        again = replace(self.DRAWN, part="mask[1]")
+        assert find_planes([self.DRAWN, again], "auto") == once
+        (told,) = repeat_warnings([self.DRAWN, again], "auto", once)
+        assert told.startswith("mask[1] shows 3 plane(s)")
+        assert repeat_warnings([self.DRAWN], "auto", once) == ()
+
+    def test_a_named_place_counts_once(self):
+        named = [Plane(stack, axis, index) for stack in (0, 1) for axis, index in self.PLANES]
+        assert find_planes([self.DRAWN] * 2, named) == tuple(sorted(named)[:3])
+
+    def test_a_turned_grid_shows_the_same_places(self):
+        turned = np.moveaxis(self.DRAWN.foreground, (0, 1, 2), (2, 0, 1))
+        affine = np.zeros((4, 4))
+        affine[[0, 1, 2, 3], [2, 0, 1, 3]] = 1.0
+        other = MaskStack("mask[1]", Grid(turned.shape, affine), turned, np.zeros_like(turned))
+        assert find_planes([self.DRAWN, other], "auto") == find_planes([self.DRAWN], "auto")
+
+    @pytest.mark.parametrize(
+        "other",
+        [
+            stack_of(cut(ellipsoid(), PLANES), origin=(0.3, 0.3, 0.3)),
+            stack_of(cut(ellipsoid(), ((0, 15), (1, 17), (2, 13)))),
+        ],
+        ids=["beside them", "of other indices"],
+    )
+    def test_other_places_count(self, other):
+        assert len(find_planes([self.DRAWN, replace(other, part="mask[1]")], "auto")) == 6
+
+    def test_the_other_half_of_a_plane_counts(self):
+        halves = [np.zeros(SHAPE, bool) for _ in range(2)]
+        halves[0][:16], halves[1][16:] = True, True
+        stacks = [
+            stack_of(self.DRAWN.foreground & half, excluded=~half, part=f"mask[{number}]")
+            for number, half in enumerate(halves)
+        ]
+        planes = find_planes(stacks, [Plane(0, 2, 12), Plane(0, 1, 16), Plane(1, 2, 12)])
+        assert Plane(1, 2, 12) in planes

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from model.errors import InvalidGeometry, InvalidMask, InvalidParameter
-from model.inference.stacks import UNIT_FACTOR, make_stack, require_length
+from model.inference.stacks import UNIT_FACTOR, make_stack, require_labels, require_length
 
 AFFINE = np.diag([1.0, 2.0, 3.0, 1.0])
 
@@ -132,6 +132,24 @@ def test_the_affine_passed_in_stays_as_it_is():
     stack = make_stack("mask[0]", values_with(1), affine)
     affine[0, 3] = 77.0
     assert stack.grid.affine[0, 3] == 0.0
+
+
+def test_an_object_in_another_unit_is_too_short():
+    values = np.zeros((40, 4, 4), np.uint8)
+    values[:, 1, 1] = 1
+    metres, millimetres = (make_stack("mask[0]", values, np.diag([step] * 3 + [1.0])) for step in (0.001, 1.0))
+    require_length([metres, millimetres], 50.0)
+    with pytest.raises(InvalidMask, match="whose voxel spacing is in mm"):
+        require_length([metres], 50.0)
+
+
+def test_labels_that_no_stack_holds_are_refused():
+    first, second = (make_stack("mask[0]", values_with(*held), AFFINE, frozenset({1, 3})) for held in ((1, 2), (3,)))
+    require_labels([first, second])
+    with pytest.raises(InvalidMask, match=r"mask\[0\] does not hold label 3;"):
+        require_labels([first])
+    with pytest.raises(InvalidMask, match="mask does not hold label 1;"):
+        require_labels([second, second])
 
 
 @given(st.floats(0.01, 100.0), st.integers(0, 2), st.integers(1, 4))

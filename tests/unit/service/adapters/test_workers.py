@@ -35,6 +35,17 @@ def test_more_than_the_places_is_refused(workers, waiting):
         assert pool.is_full()
 
 
+def test_a_place_is_anothers_while_its_client_takes_what_was_made():
+    pool = WorkerPool(1, 0)
+    with pool.admit() as slow:
+        with slow.aside():
+            assert not pool.is_full()
+            with pool.admit():
+                assert pool.is_full()
+        assert pool.is_full()
+    assert not pool.is_full()
+
+
 def test_never_more_run_than_there_are_workers():
     async def scenario():
         pool, together, most = WorkerPool(2, 20), [0], [0]
