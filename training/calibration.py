@@ -29,7 +29,7 @@ from training.oblique import SliceStacks
 from training.posterior_scale import posterior_scale
 from training.probability_scale import as_facts, best_scale, cross_entropies
 from training.scored_drawing import ScoredDrawing, scored_drawing
-from training.seen import check_unseen
+from training.seen import check_unseen, short_digest
 from training.usual import sound_answers, typical_figures, usual_figures
 
 #: Precisions that are tried (1/mm^2), fidelities, and the regimes that they are tried on.
@@ -111,6 +111,7 @@ def calibrate_bundle(
         "cohort": cohort.name,
         "split": "validation",
         "cases": [case.name for case in evenly(cohort.validation, CASES)],
+        "masks": [short_digest(case) for case in cohort.validation],
         "regimes": list(REGIMES),
         "error_by_precision_and_fidelity": found.as_facts(),
     }

@@ -176,6 +176,12 @@ def export(
         check_output(output, is_folder=True)
         choice = ExportChoice(prune, least_movement, training_share, by_cohort=source.is_given)
         parts = choice.parts(stood_still=wants_prior(run))
+        if not source.is_given and (source.align or options != CohortOptions()):
+            raise InvalidParameter(
+                "--align, --seed, --test-fraction, --skip-refused and --shippable would do nothing here; they go with "
+                "--cohort, --masks and --meshes.",
+                part="cohort",
+            )
         if parts is not None and source.is_given:
             parts = _parts_for(run, parts, source, options)
         manifest = _exported_with_progress(run, output, parts, naming)
@@ -200,9 +206,11 @@ def _exported_with_progress(run: Path, output: Path, parts: "PriorParts | None",
 
 
 def _parts_for(run: Path, parts: "PriorParts", source: CohortSource, options: CohortOptions) -> "PriorParts":
-    from training.prior_choice import MODELS, chosen_parts
+    from training.prior_choice import MODELS, check_own, chosen_parts
 
     found = opened_cohort(source, options)
+    tell_findings(found)
+    check_own(run, found.train)
     if not found.validation:
         raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
     with progress(MODELS, f"choosing the prior on {found.name}") as bar:
@@ -281,6 +289,7 @@ def calibrate(
 
         before = given_bundle(bundle)
         found = opened_cohort(source, options)
+        tell_findings(found)
         if not found.validation:
             raise InvalidParameter("The cohort has no validation cases; a larger one is accepted.", part="cohort")
         warn(expectations.of_calibration(found))

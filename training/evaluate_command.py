@@ -11,7 +11,7 @@ from training.choices import OTHER_SPLIT, RegimeName, SplitName
 from training.cohort_options import opened_cohort, takes_cohort
 from training.cohorts import CohortOptions
 from training.cohorts.sources import CohortSource
-from training.console import JsonOption, exit_status, progress
+from training.console import JsonOption, exit_status, progress, tell_findings
 from training.outputs import ForceOption, check_new_files
 
 if TYPE_CHECKING:
@@ -40,10 +40,14 @@ def evaluate(
         from training.evaluate import find_bundle, open_named, shipped_bundles
         from training.report import as_json as json_of
         from training.report import as_text, record_accuracy, summarise, write_csv
-        from training.seen import check_unseen
+        from training.seen import check_uncalibrated, check_unseen
 
         if output is not None:
             check_new_files(output, force=force)
+        if offset is not None and not {RegimeName.THIN, RegimeName.THICK} & set(regime or RegimeName):
+            raise InvalidParameter(
+                "--offset would do nothing here; it goes with the regimes thin and thick.", part="offset"
+            )
         if record and (limit is not None or offset is not None):
             raise InvalidParameter(
                 "A manifest holds figures of all cases with slices that are centred on the object; --record is "
@@ -52,10 +56,13 @@ def evaluate(
             )
         opened = open_named(model)
         found = opened_cohort(source, options)
+        tell_findings(found)
         cases = found.of_split(split.value)[:limit]
         if not cases:
             raise InvalidParameter(f"The cohort has no {split} cases; {OTHER_SPLIT[split]}.", part="split")
         check_unseen(opened.manifest, cases, split.value)
+        if split is SplitName.TEST:
+            check_uncalibrated(opened.manifest, cases)
         regimes = tuple(regime or (RegimeName.THIN, RegimeName.THICK, RegimeName.ORTHOGONAL))
         measured = _evaluate_with_progress(opened, cases, regimes, offset, options.seed)
         if output is not None:

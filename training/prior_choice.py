@@ -90,10 +90,28 @@ def chosen_parts(
     return choice_by(trained[best], lambda candidate: errors(trial_model(run, candidate), best), parts)
 
 
-def _check_unseen(run: Path, cases: Sequence[Case]) -> None:
+def check_own(run: Path, cases: Sequence[Case]) -> None:
+    """Refuse training shapes of another cohort than that of the run.
+
+    Raises:
+        InvalidParameter: the run was trained on none of the cases.
+    """
+    if cases and not _trained_on(run, cases):
+        raise InvalidParameter(
+            "The run was trained on other shapes than those of this cohort; the cohort, --seed and --test-fraction of "
+            "the training are accepted.",
+            part="cohort",
+        )
+
+
+def _trained_on(run: Path, cases: Sequence[Case]) -> list[str]:
     values = read_record(run)[1]
     seen = {*values["train"].values(), *values.get("voxel_digests", ())}
-    names = [case.name for case in cases if mask_digest(case) in seen or is_among(case, seen)]
+    return [case.name for case in cases if mask_digest(case) in seen or is_among(case, seen)]
+
+
+def _check_unseen(run: Path, cases: Sequence[Case]) -> None:
+    names = _trained_on(run, cases)
     if names:
         raise InvalidParameter(
             f"The run was trained on {listed(names)}, which is to be among the validation cases; the cohort, --seed "

@@ -49,6 +49,23 @@ def check_unseen(manifest: Manifest, cases: Sequence[Case], measured: str = "val
         )
 
 
+def check_uncalibrated(manifest: Manifest, cases: Sequence[Case]) -> None:
+    """Refuse to test on shapes that the model was calibrated on; nothing is known of models without their digests.
+
+    Raises:
+        InvalidParameter: it was calibrated on one of the cases.
+    """
+    masks = manifest.calibration.get("masks")
+    known = set(masks) if isinstance(masks, tuple | list) else set()
+    seen = [case.name for case in cases if known and is_among(case, known)]
+    if seen:
+        raise InvalidParameter(
+            f"The model was calibrated on {listed(seen)}, which is to be among the test cases; the same --seed and "
+            "--test-fraction for train, export, calibrate and evaluate are accepted.",
+            part="cohort",
+        )
+
+
 def check_seen(manifest: Manifest, cases: Sequence[Case]) -> None:
     """Refuse to learn from shapes that the model was not trained on, with which it may be measured.
 

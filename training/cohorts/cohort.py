@@ -143,13 +143,16 @@ def hold_out(cases: Sequence[Case], *, fraction: float, seed: int, split: Split 
     """Move a share of the training persons to another split, all cases of a person together.
 
     The choice depends on the persons and the seed, not on the order of the cases. One person at the
-    least is held out, unless there is only one. Nothing moves when the split exists already.
+    least is held out, unless there is only one. Nothing moves when the split exists already. Of one drawing of lots
+    the first are for validation and the last for the test, so that whoever asks for a test split only after shapes
+    were used for validation does not get these.
     """
     persons = sorted({case.person for case in cases if case.split == "train"})
     if len(persons) < 2 or fraction <= 0 or any(case.split == split for case in cases):
         return tuple(cases)
     count = min(max(1, round(fraction * len(persons))), len(persons) - 1)
-    held = set(np.random.default_rng(seed).permutation(persons)[:count].tolist())
+    lots = np.random.default_rng(seed).permutation(persons).tolist()
+    held = set(lots[-count:] if split == "test" else lots[:count])
     return tuple(
         replace(case, split=split) if case.split == "train" and case.person in held else case for case in cases
     )

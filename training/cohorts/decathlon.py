@@ -13,7 +13,7 @@ from typing import Any
 from model.errors import CohortError
 from training.cohorts.assemble import CohortOptions, assemble
 from training.cohorts.cohort import Cohort, Provenance, Refusal
-from training.cohorts.folder import merged, read_cases, read_table
+from training.cohorts.folder import absent, merged, read_cases, read_table, require_one_table
 from training.cohorts.reading import is_mask_file, stem
 
 DESCRIPTION = "dataset.json"
@@ -35,11 +35,14 @@ def read_decathlon(folder: Path, options: CohortOptions, *, labels: Collection[i
         Refusal(stem(path), "the description lists it but its label is missing") for path in files if not path.is_file()
     ]
     tests = _files(folder / "labelsTs")
-    rows = merged({stem(path): {"split": "test"} for path in tests}, read_table(folder / "cases.csv"))
+    require_one_table(folder)
+    table = read_table(folder / "cases.csv")
+    rows = merged({stem(path): {"split": "test"} for path in tests}, table)
     present = [path for path in files if path.is_file()]
     cases, refused = read_cases([*present, *tests], folder, rows, labels)
     name = str(facts.get("name") or folder.resolve().name).lower()
-    return assemble(name, cases, [*refused, *missing], _provenance(facts), options)
+    refused += [*missing, *absent(table, map(stem, (*files, *tests)))]
+    return assemble(name, cases, refused, _provenance(facts), options)
 
 
 def _description(path: Path) -> Mapping[str, Any]:

@@ -2,8 +2,8 @@
 
 Columns of ``cases.csv`` that are read: ``case`` (file name without suffix), ``split`` (train, validation
 or test), ``person`` (or ``subject``, or ``patient``), ``source``, ``licence``. A file without a row, or a folder
-without the table, takes its split from the innermost folder on the way to it that is named train, validation or test,
-or else train; its person is its own name. Sub-folders are searched as well.
+without the table, takes its split from the innermost folder on the way to it that is named train, validation or test, or by
+`ALSO_SPLITS`, or else train; its person is its own name. Sub-folders are searched as well.
 """
 
 import csv
@@ -14,12 +14,23 @@ from typing import cast
 from model.errors import CohortError, InputError
 from training.cohorts.assemble import CohortOptions, assemble
 from training.cohorts.cohort import NOT_STATED, Case, Cohort, Provenance, Refusal, Split, listed
-from training.cohorts.reading import MaskFile, is_mask_file, read_mask, stem
+from training.cohorts.reading import SUFFIXES, MaskFile, is_mask_file, read_mask, stem
 
 Row = Mapping[str, str]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 #: Columns that say whose a case is, the first that is there; and what else is read.
 PERSON, READ = ("person", "subject", "patient"), ("case", "split", "source", "licence")
+#: Other usual names of the splits.
+ALSO_SPLITS: Mapping[str, Split] = {
+    **{split: split for split in SPLITS},
+    "training": "train",
+    "val": "validation",
+    "valid": "validation",
+    "testing": "test",
+}
+#: Formats of tables, and of images and label maps, that are not read.
+TABLES = (".csv", ".tsv", ".txt", ".xlsx", ".xls", ".ods")
+OTHER_IMAGES = (".mgz", ".mgh", ".hdr", ".dcm", ".tif", ".tiff", ".npy", ".npz", ".vti", ".minc", ".mnc")
 #: What may stand between two columns.
 SEPARATORS = ",;\t"
 OWN_MASKS = Provenance("masks of the caller", "not stated", "", shippable=False)
@@ -41,10 +52,12 @@ def read_folder(
     """
     if not folder.is_dir():
         raise CohortError("The folder of masks does not exist; an existing folder is accepted.")
+    require_one_table(folder)
     rows = read_table(folder / "cases.csv")
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and is_mask_file(path))
+    found = [path for path in folder.rglob("*") if path.is_file()]
+    files = sorted(path for path in found if is_mask_file(path))
     cases, refused = read_cases(files, folder, rows, labels)
-    refused += absent(rows, files)
+    refused += [*absent(rows, map(stem, files)), *unread_files(found, OTHER_IMAGES, ", ".join(SUFFIXES))]
     return assemble(name or folder.resolve().name, cases, refused, provenance, options, side=side)
 
 
@@ -75,7 +88,7 @@ def read_table(path: Path, keep: Callable[[Row], bool] = lambda row: True, *, pe
         raise CohortError(
             "The table of cases has a row without a case or a case twice; one row for each case is accepted."
         )
-    unknown = sorted({row["split"] for row in rows if row.get("split")} - set(SPLITS))
+    unknown = sorted({row["split"] for row in rows if row.get("split")} - set(ALSO_SPLITS))
     if unknown:
         raise CohortError(
             f"The table of cases names an unknown split, {listed(unknown)}; train, validation or test is accepted."
@@ -86,7 +99,8 @@ def read_table(path: Path, keep: Callable[[Row], bool] = lambda row: True, *, pe
             f"The table of cases has no column person, and {listed(unread)} is not read, so that cases of one person "
             "could stand in several splits; a column person, subject or patient is accepted."
         )
-    return {row["case"]: row for row in rows if keep(row)}
+    read = ({**row, "split": ALSO_SPLITS[row["split"]]} if row.get("split") else row for row in rows)
+    return {row["case"]: row for row in read if keep(row)}
 
 
 def _parsed(path: Path) -> tuple[list[str], list[Row]]:
@@ -116,10 +130,32 @@ def merged(known: Mapping[str, Row], table: Mapping[str, Row]) -> dict[str, Row]
     }
 
 
-def absent(rows: Iterable[str], files: Collection[Path]) -> list[Refusal]:
-    """Cases that a table lists and no file holds."""
-    missing = sorted(set(rows) - {stem(path) for path in files})
-    return [Refusal(case, "the table lists it but its file is missing") for case in missing]
+def absent(rows: Iterable[str], known: Iterable[str]) -> list[Refusal]:
+    """Cases that a table lists and no file holds.
+
+    Args:
+        known: names of the files without their suffix, and whatever else a row may be named after.
+    """
+    reason = "the table lists it but its file is missing; names of files without their suffix are accepted"
+    return [Refusal(case, reason) for case in sorted(set(rows) - set(known))]
+
+
+def require_one_table(folder: Path) -> None:
+    """Refuse a table of cases that would not be read: `CohortError`."""
+    tables = [path for path in folder.rglob("*") if path.suffix.lower() in TABLES and path.stem.lower() == "cases"]
+    unread = [path.relative_to(folder).as_posix() for path in tables if path != folder / "cases.csv"]
+    if unread:
+        raise CohortError(
+            f"The folder holds {listed(sorted(unread))}, which is not read; one table cases.csv, at the top of the "
+            "folder, is accepted."
+        )
+
+
+def unread_files(files: Iterable[Path], suffixes: Collection[str], accepted: str) -> list[Refusal]:
+    """Files of shapes whose format is not read, each left out by its name."""
+    reason = f"files of this format are not read; {accepted} are accepted"
+    others = [path for path in files if path.name.lower().endswith(tuple(suffixes)) and not path.name.startswith(".")]
+    return [Refusal(path.name, reason, stops=False) for path in sorted(others)]
 
 
 def read_cases(
@@ -165,4 +201,4 @@ def _case(path: Path, root: Path, row: Row, found: MaskFile) -> Case:
 def split_by_folder(path: Path, root: Path) -> Split:
     """Split of a file by the innermost folder below the root that is named after one, train when none is."""
     folders = [part.lower() for part in path.relative_to(root).parts[:-1]]
-    return next((split for part in reversed(folders) for split in SPLITS if part == split), "train")
+    return next((ALSO_SPLITS[part] for part in reversed(folders) if part in ALSO_SPLITS), "train")

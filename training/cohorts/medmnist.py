@@ -50,8 +50,12 @@ def read_arrays(path: Path, name: str, *, spacing_mm: float = 1.0, splits: Mappi
 def _cases(images: Shaped[np.ndarray, "..."], name: str, split: Split, key: str, spacing_mm: float) -> Iterator[Case]:
     if images.ndim != 4:
         raise CohortError(f"The array {key} has {images.ndim} axes; masks (n, i, j, k) of MedMNIST 3D are accepted.")
-    if len(np.unique(images[: min(len(images), 16)])) > 2:
-        raise CohortError(f"The array {key} holds grey values; the sets of masks are accepted (adrenal and vessel).")
+    found = sorted({value for image in images for value in np.unique(image).tolist()})
+    if len(found) > 2 or any(not 0 <= value < np.inf for value in found) or 0 not in (found or [0]):
+        raise CohortError(
+            f"The array {key} holds other values than 0 and one of the object; the sets of masks are accepted (adrenal "
+            "and vessel)."
+        )
     shape = (images.shape[1], images.shape[2], images.shape[3])
     grid = Grid(shape, np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0]))
     for number, image in enumerate(images):

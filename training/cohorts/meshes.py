@@ -15,8 +15,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import VTK_UNSIGNED_CHAR, vtkObject
-from vtkmodules.vtkCommonDataModel import vtkImageData
-from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkFeatureEdges, vtkTriangleFilter
+from vtkmodules.vtkCommonDataModel import vtkImageData, vtkPolyData
+from vtkmodules.vtkFiltersCore import (
+    vtkCleanPolyData,
+    vtkFeatureEdges,
+    vtkPolyDataConnectivityFilter,
+    vtkTriangleFilter,
+)
 from vtkmodules.vtkImagingStencil import vtkImageStencil, vtkPolyDataToImageStencil
 from vtkmodules.vtkIOGeometry import vtkOBJReader, vtkSTLReader
 from vtkmodules.vtkIOLegacy import vtkPolyDataReader
@@ -27,7 +32,7 @@ from model.errors import CohortError, InvalidMask, UnreadableImage
 from model.geometry import Grid
 from training.cohorts.assemble import CohortOptions, assemble
 from training.cohorts.cohort import Cohort, Provenance
-from training.cohorts.folder import absent, read_cases, read_table
+from training.cohorts.folder import absent, read_cases, read_table, require_one_table, unread_files
 from training.cohorts.inspect import EXTENT_RANGE_MM
 from training.cohorts.reading import MaskFile, stem
 from training.cohorts.voxelising import SpaceName, Voxelising
@@ -40,6 +45,8 @@ READERS: dict[str, Callable[[], Any]] = {
     ".vtp": vtkXMLPolyDataReader,
 }
 SUFFIXES = tuple(READERS)
+#: Formats of meshes that are not read.
+OTHER_MESHES = (".off", ".glb", ".gltf", ".3mf", ".mz3", ".dae", ".x3d", ".wrl", ".vtu", ".gii", ".msh", ".fbx", ".pcd")
 OWN_MESHES = Provenance("meshes of the caller", "not stated", "", shippable=False)
 ONE_MM = Voxelising()
 #: Room of background around a mesh (mm), and the most voxels that one may become.
@@ -59,12 +66,14 @@ def read_meshes(folder: Path, options: CohortOptions, *, how: Voxelising = ONE_M
     """
     if not folder.is_dir():
         raise CohortError("The folder of meshes does not exist; an existing folder is accepted.")
+    require_one_table(folder)
     rows = read_table(folder / "cases.csv")
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and is_mesh_file(path))
+    found = [path for path in folder.rglob("*") if path.is_file()]
+    files = sorted(path for path in found if is_mesh_file(path))
     if not files:
         raise CohortError(f"The folder holds no mesh; {', '.join(SUFFIXES)} are accepted.")
     cases, refused = read_cases(files, folder, rows, read=lambda path: read_mesh(path, how))
-    refused += absent(rows, files)
+    refused += [*absent(rows, map(stem, files)), *unread_files(found, OTHER_MESHES, ", ".join(SUFFIXES))]
     return assemble(folder.resolve().name, cases, refused, OWN_MESHES, options)
 
 
@@ -103,6 +112,8 @@ def closed_surface(path: Path) -> Any:
     surface = clean.GetOutput()
     if reader.GetErrorCode() or surface.GetNumberOfPolys() == 0:
         raise UnreadableImage("the file cannot be read; a complete mesh of triangles is accepted", part=stem(path))
+    if not np.isfinite(vtk_to_numpy(surface.GetPoints().GetData())).all():
+        raise InvalidMask("the mesh has points that are not finite; finite coordinates are accepted", part=stem(path))
     edges = _bad_edges(surface)
     if edges:
         raise InvalidMask(
@@ -132,12 +143,56 @@ def voxelised(surface: Any, how: Voxelising, name: str) -> MaskFile:
     lower, shape = _lattice(bounds, how.spacing_mm)
     if shape.astype(float).prod() > MOST_VOXELS:
         raise InvalidMask(f"the mesh would have over {MOST_VOXELS} voxels; a larger spacing is accepted", part=name)
-    mask = _stencil(surface, lower, shape, how.spacing_mm)
+    mask = _filled(surface, lower, shape, how.spacing_mm, name)
     affine = np.diag([how.spacing_mm] * 3 + [1.0])
     affine[:3, 3] = lower
     if how.space is SpaceName.LPS:
         affine = np.diag([-1.0, -1.0, 1.0, 1.0]) @ affine
     return MaskFile(mask, Grid((int(shape[0]), int(shape[1]), int(shape[2])), affine))
+
+
+def _filled(surface: Any, lower: Float[np.ndarray, "3"], shape: Any, spacing_mm: float, name: str) -> Any:
+    """What the closed parts of a surface enclose: those inside others are cavities, or lie in these.
+
+    Raises:
+        InvalidMask: parts that overlap, of which it is not said what they enclose together.
+    """
+    parts = _parts(surface)
+    if len(parts) == 1:
+        return _stencil(surface, lower, shape, spacing_mm)
+    inside = np.zeros(tuple(shape), bool)
+    for part in parts:
+        own = _stencil(part, lower, shape, spacing_mm)
+        common = own & inside
+        if common.any() and not np.array_equal(common, own):
+            raise InvalidMask(
+                "the mesh has closed parts that overlap; parts inside or beside each other are accepted", part=name
+            )
+        inside ^= own
+    return inside
+
+
+def _parts(surface: Any) -> list[Any]:
+    """The connected parts of a surface, by their extent, largest first."""
+    every = vtkPolyDataConnectivityFilter()
+    every.SetInputData(surface)
+    every.SetExtractionModeToAllRegions()
+    every.ColorRegionsOn()
+    every.Update()
+    if every.GetNumberOfExtractedRegions() == 1:
+        return [surface]
+    one, clean, parts = vtkPolyDataConnectivityFilter(), vtkCleanPolyData(), []
+    one.SetInputData(surface)
+    one.SetExtractionModeToSpecifiedRegions()
+    clean.SetInputConnection(one.GetOutputPort())
+    for number in range(every.GetNumberOfExtractedRegions()):
+        one.InitializeSpecifiedRegionList()
+        one.AddSpecifiedRegion(number)
+        clean.Update()
+        part = vtkPolyData()
+        part.DeepCopy(clean.GetOutput())
+        parts.append(part)
+    return sorted(parts, key=lambda part: -float(part.GetLength()))
 
 
 def _lattice(bounds: Float[np.ndarray, "3 2"], step_mm: float) -> tuple[Float[np.ndarray, "3"], Int[np.ndarray, "3"]]:

@@ -35,7 +35,7 @@ def read_published(
         if is_mask_file(path) and stem(path) in rows
     )
     cases, refused = read_cases(files, folder, rows)
-    refused += absent(rows, files)
+    refused += absent(rows, map(stem, files))
     return assemble(folder.name, cases, refused, provenance, options, side=side)
 
 

@@ -6,6 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from model.errors import InvalidParameter
+from model.inference.stacks import checked_labels
 from training.cohorts.assemble import CohortOptions
 from training.cohorts.catalogue import CohortName, data_folder, load_cohort
 from training.cohorts.cohort import Cohort, SideName
@@ -133,6 +134,7 @@ def open_cohort(source: CohortSource, options: CohortOptions, watch: Watch = lam
     if options.shippable_only and source.cohort is None:
         raise InvalidParameter("A folder of masks has no licence; --shippable goes with --cohort.", part="shippable")
     check_given(source, [one.name for one in fields(source) if getattr(source, one.name) != one.default])
+    checked_labels(frozenset(source.labels) or None)
     found = _read(source, options)
     if source.side is not None:
         found = replace(found, side=SideName(source.side).value)
@@ -167,7 +169,7 @@ def read_masks(
         case LayoutName.DECATHLON:
             return read_decathlon(path, options, labels=labels)
         case LayoutName.MEDMNIST:
-            return read_medmnist(path, options, spacing_mm=spacing_mm)
+            return read_medmnist(path, options, spacing_mm=Voxelising(spacing_mm).spacing_mm)
         case LayoutName.VERSE:
             return read_verse(path, options, labels=labels)
         case LayoutName.OAI_ZIB:

@@ -53,8 +53,10 @@ def read_verse(folder: Path, options: CohortOptions, *, labels: Collection[int] 
     if unknown:
         raise CohortError(f"Label {unknown[0]} is no vertebra of VerSe; 1 to 25 and 28 are accepted.")
     scans = sorted(path for path in folder.rglob(f"*{MASK}") if not path.name.startswith("."))
-    if not scans:
-        raise CohortError(f"The folder holds no derivatives/sub-*/*{MASK}; VerSe by subject is accepted.")
+    if not scans or not all(scan.parent.name.startswith("sub-") for scan in scans):
+        raise CohortError(
+            f"The folder holds no derivatives/sub-*/*{MASK}, or such files elsewhere; VerSe by subject is accepted."
+        )
     cases: list[Case] = []
     refused: list[Refusal] = []
     for scan in scans:

@@ -241,6 +241,19 @@ class TestExport:
         assert "Nothing is pruned" in result.stderr
         assert not (tmp_path / "out").exists()
 
+    @pytest.mark.parametrize("option", [("--seed", 3), ("--align",), ("--skip-refused",), ("--test-fraction", 0.4)])
+    def test_options_of_a_cohort_without_one_are_refused(self, run, bundle, tmp_path, option):
+        result = run("export", bundle.parent / "run", "--output", tmp_path / "out", *option)
+        assert result.exit_code == 2
+        assert "would do nothing" in result.stderr
+
+    def test_the_prior_is_not_chosen_on_another_cohort(self, run, bundle, tmp_path):
+        for n in range(5):
+            write(tmp_path / "masks", f"other{n}", ellipsoid(20 + n))
+        result = run("export", bundle.parent / "run", "--output", tmp_path / "out", "--masks", tmp_path / "masks")
+        assert result.exit_code == 2
+        assert "trained on other shapes" in result.stderr
+
     def test_a_cohort_where_nothing_is_chosen_is_refused(self, run, bundle, tmp_path):
         words = ("export", bundle.parent / "run", "--output", tmp_path / "out", "--masks", bundle.parent / "masks")
         result = run(*words, "--no-prune")

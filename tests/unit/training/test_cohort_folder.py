@@ -25,6 +25,28 @@ class TestFolder:
         cohort = read_folder(tmp_path, CohortOptions())
         assert {found.name for found in cohort.test} == {"b0", "b1"}
 
+    @pytest.mark.parametrize(("train", "held", "test"), [("Training", "val", "Testing"), ("train", "valid", "test")])
+    def test_other_usual_names_are_splits_too(self, tmp_path, train, held, test):
+        for n, name in enumerate((train, train, train, held, test)):
+            write(tmp_path / name, f"b{n}", ball(5 + 0.3 * n))
+        cohort = read_folder(tmp_path, CohortOptions())
+        assert [case.name for case in (*cohort.validation, *cohort.test)] == ["b3", "b4"]
+        write_table(tmp_path, [{"case": f"b{n}", "person": f"p{n}", "split": held} for n in (0, 3, 4)])
+        assert len(read_folder(tmp_path, CohortOptions()).validation) == 3
+
+    @pytest.mark.parametrize("name", ["Cases.csv", "cases.tsv", "train/cases.csv"])
+    def test_a_table_that_is_not_read_is_refused(self, tmp_path, name):
+        write_balls(tmp_path / "train")
+        (tmp_path / name).write_text("case,person\nball0,p\nball1,p\n")
+        with pytest.raises(CohortError, match=f"holds {name}, which is not read"):
+            read_folder(tmp_path, CohortOptions())
+
+    def test_images_of_other_formats_are_told(self, tmp_path):
+        write_balls(tmp_path)
+        for name in ("a.mgz", "b.dcm", "readme.txt", ".hidden.mgz"):
+            (tmp_path / name).write_bytes(b"")
+        assert [one.name for one in read_folder(tmp_path, CohortOptions()).refused] == ["a.mgz", "b.dcm"]
+
     @pytest.mark.parametrize("deeper", ["sub-{n}", "Train/sub-{n}/anat", ""])
     def test_the_innermost_folder_that_is_named_after_a_split_says_it(self, tmp_path, deeper):
         root = tmp_path / "train" / "cohort"

@@ -49,6 +49,41 @@ class TestMeshes:
         world = case.grid.to_world(np.argwhere(case.mask).astype(float))
         assert world.mean(axis=0) == pytest.approx([-3.0, 20.0, 7.0], abs=0.1)
 
+    def test_points_that_are_not_finite_are_refused_by_name(self, folder):
+        mesh = self.ellipsoid(0)
+        lines = [f"v {' '.join(map(str, point))}" for point in mesh.vertices]
+        lines[7] = "v nan 0 0"
+        faces = [f"f {' '.join(str(number + 1) for number in face)}" for face in mesh.faces]
+        (folder / "nan.obj").write_text("\n".join([*lines, *faces]))
+        with pytest.raises(CohortError, match="nan: the mesh has points that are not finite"):
+            opened(meshes=folder)
+
+    @pytest.mark.parametrize(
+        ("scale", "at", "share"),
+        [(0.5, (3.0, -20.0, 7.0), -0.125), (0.5, (40.0, -20.0, 7.0), 0.125), (1.0, (8.0, -20.0, 7.0), None)],
+        ids=["a cavity", "a part beside it", "parts that overlap"],
+    )
+    def test_closed_parts_are_put_together_where_it_is_said_how(self, tmp_path, scale, at, share):
+        for n in range(2):
+            self.ellipsoid(n).export(tmp_path / f"e{n}.stl")
+        whole = self.ellipsoid(2)
+        part = self.ellipsoid(2, at=(0.0, 0.0, 0.0))
+        part.apply_scale(scale)
+        part.apply_translation(at)
+        trimesh.util.concatenate([whole, part]).export(tmp_path / "two.stl")
+        if share is None:
+            with pytest.raises(CohortError, match="two: the mesh has closed parts that overlap"):
+                opened(meshes=tmp_path)
+            return
+        options = CohortOptions(validation_fraction=0.0, skip_refused=True)
+        found = {case.name: case for case in opened(options, meshes=tmp_path, spacing_mm=0.5).train}
+        assert found["two"].mask.sum() * 0.5**3 == pytest.approx((1.0 + share) * whole.volume, rel=0.01)
+
+    def test_meshes_of_other_formats_are_told(self, folder):
+        self.ellipsoid(5).export(folder / "e5.off")
+        (told,) = opened(meshes=folder).refused
+        assert (told.name, told.stops) == ("e5.off", False)
+
     def test_an_open_mesh_is_refused_by_name(self, folder):
         mesh = self.ellipsoid(0)
         mesh.update_faces(np.arange(len(mesh.faces)) > 5)

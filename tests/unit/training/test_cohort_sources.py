@@ -105,6 +105,12 @@ class TestDecathlon:
         (tmp_path / "cases.csv").write_text("case,split\nhippocampus_900,train\nhippocampus_000,test\n")
         assert [case.name for case in opened(masks=tmp_path, layout=LayoutName.DECATHLON).test] == ["hippocampus_000"]
 
+    def test_a_row_of_no_file_is_refused(self, tmp_path):
+        self.write(tmp_path)
+        (tmp_path / "cases.csv").write_text("case,split\nhippocampus_000.nii.gz,test\n")
+        with pytest.raises(CohortError, match=r"hippocampus_000.nii.gz: .*its file is missing; .*without their suffix"):
+            opened(masks=tmp_path, layout=LayoutName.DECATHLON)
+
     def test_a_label_that_is_missing_is_named(self, tmp_path):
         self.write(tmp_path)
         (tmp_path / "labelsTr" / "hippocampus_002.nii.gz").unlink()
@@ -128,8 +134,22 @@ class TestMedMnist:
 
     def test_grey_values_are_refused(self, tmp_path):
         np.savez(tmp_path / "organ.npz", train_images=np.random.default_rng(0).integers(0, 255, (3, 9, 9, 9)))
-        with pytest.raises(CohortError, match="grey values"):
+        with pytest.raises(CohortError, match="other values than 0 and one"):
             opened(masks=tmp_path / "organ.npz", layout=LayoutName.MEDMNIST)
+
+    @pytest.mark.parametrize("value", [2, -1, np.nan])
+    def test_another_value_in_any_image_is_refused(self, tmp_path, value):
+        images = np.stack([ball(5.0 + 0.1 * n) for n in range(20)]).astype(float)
+        images[18, 0, 0, 0] = value
+        np.savez(tmp_path / "vessel.npz", train_images=images)
+        with pytest.raises(CohortError, match="other values than 0 and one"):
+            opened(masks=tmp_path / "vessel.npz", layout=LayoutName.MEDMNIST)
+
+    @pytest.mark.parametrize("spacing_mm", [-1.0, 0.0, np.nan])
+    def test_a_voxel_size_that_none_has_is_refused(self, tmp_path, spacing_mm):
+        np.savez(tmp_path / "vessel.npz", train_images=np.stack([ball(5.0), ball(6.0)]))
+        with pytest.raises(InvalidParameter, match=r"spacing_mm .* 0.05 to 20 mm is accepted"):
+            opened(masks=tmp_path / "vessel.npz", layout=LayoutName.MEDMNIST, spacing_mm=spacing_mm)
 
     def test_other_files_are_refused(self, tmp_path):
         (tmp_path / "no.npz").write_bytes(b"PK")
@@ -263,6 +283,16 @@ class TestOaiZib:
         assert everything["9001100.segmentation_masks"].person == everything["9001100_V01"].person == "9001100"
         assert int(everything["9001101.segmentation_masks"].mask.sum()) == int(ball(5.2).sum())
         assert sorted(everything["9001101.segmentation_masks"].grid.spacing) == pytest.approx([0.36, 0.36, 0.7])
+
+    def test_a_row_of_no_knee_is_refused_and_files_of_other_names_are_told(self, tmp_path):
+        for n in range(3):
+            self.write(tmp_path, f"90011{n:02d}", 5.0 + 0.2 * n)
+        self.write(tmp_path, "knee", 5.5)
+        found = opened(CohortOptions(), masks=tmp_path, layout=LayoutName.OAI_ZIB)
+        assert [(one.name, one.stops) for one in found.refused] == [("knee.segmentation_masks.mhd", False)]
+        (tmp_path / "cases.csv").write_text("case,split\n9001101,test\n9001102.segmentation_masks.mhd,test\n")
+        with pytest.raises(CohortError, match=r"9001102.segmentation_masks.mhd: .*its file is missing"):
+            opened(CohortOptions(), masks=tmp_path, layout=LayoutName.OAI_ZIB)
 
     def test_a_folder_of_other_masks_is_refused(self, tmp_path):
         save(tmp_path / "femur.nii.gz", ball())

@@ -105,6 +105,15 @@ class TestSplits:
         other = {found.name: found.split for found in hold_out([cases[n] for n in order], fraction=0.3, seed=seed)}
         assert one == other
 
+    @given(seed=st.integers(0, 20), count=st.integers(5, 30))
+    def test_what_was_held_out_for_validation_is_not_what_a_test_split_holds_out_later(self, seed, count):
+        cases = [case(f"c{n}", ball(1.0, 3)) for n in range(count)]
+        validated = {one.name for one in hold_out(cases, fraction=0.2, seed=seed) if one.split == "validation"}
+        tested = {one.name for one in hold_out(cases, fraction=0.2, seed=seed, split="test") if one.split == "test"}
+        assert validated
+        assert tested
+        assert not validated & tested
+
     def test_test_cases_stay(self):
         cases = [*balls(), case("t", ball(4.0), split="test")]
         assert hold_out(cases, fraction=0.5, seed=0)[-1].split == "test"

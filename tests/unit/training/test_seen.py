@@ -20,7 +20,7 @@ from training.completion.release import complete_bundle
 from training.config import TrainingConfig
 from training.evaluate import shipped_bundles
 from training.runs import RECORD, prepare, record
-from training.seen import DIGITS, check_seen, check_unseen, is_among, short_digest
+from training.seen import DIGITS, check_seen, check_uncalibrated, check_unseen, is_among, short_digest
 
 CASES = tuple(Case(f"e{n}", f"e{n}", "train", shape.mask(GRID), GRID) for n, shape in enumerate(ellipsoids(6)))
 BEFORE = replace(read_manifest(shipped_bundles() / "talus")[0], training_masks=())
@@ -32,6 +32,14 @@ def test_shapes_of_the_training_are_not_measured_on_and_others_are():
     with pytest.raises(InvalidParameter, match="trained on e3, which is to be among the test cases; --seed") as caught:
         check_unseen(MANIFEST, CASES[3:], "test")
     assert caught.value.part == "cohort"
+
+
+def test_shapes_of_the_calibration_are_not_tested_on():
+    calibrated = replace(MANIFEST, calibration={"masks": [short_digest(CASES[4])]})
+    check_uncalibrated(calibrated, CASES[5:])
+    check_uncalibrated(MANIFEST, CASES)
+    with pytest.raises(InvalidParameter, match="calibrated on e4, which is to be among the test cases"):
+        check_uncalibrated(calibrated, CASES[4:])
 
 
 def test_shapes_beyond_the_training_are_not_learnt_from():
