@@ -95,7 +95,7 @@ def _deidentify(study: Path, output: Path, limits: ImageLimits) -> DeidentifiedS
 
 def _write_objects(study: Path, output: Path) -> tuple[list["StudyFile"], dict[str, str], list[LeftOutFile]]:
     """Objects by the names that they were written under, those that they had, and the files that were left out."""
-    from service.adapters.dicom.deidentification import LeftOut, StudyFile, cleared, read_study
+    from service.adapters.dicom.deidentification import LeftOut, StudyFile, cleared, read_study, without_pixels
 
     kept: list[StudyFile] = []
     originals: dict[str, str] = {}
@@ -107,7 +107,7 @@ def _write_objects(study: Path, output: Path) -> tuple[list["StudyFile"], dict[s
         elif isinstance(found, StudyFile):
             name = f"dicom/{len(kept):06d}.dcm"
             _write(output / name, data)
-            kept.append(StudyFile(name, found.content))
+            kept.append(StudyFile(name, without_pixels(found.content)))
             originals[name] = found.name
     return kept, originals, unused
 

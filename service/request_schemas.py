@@ -107,7 +107,7 @@ class MeshQuery(_Closed):
         ge=0.0,
         le=10.0,
         allow_inf_nan=False,
-        description="fewer triangles, none of them farther than this (mm) from the full surface",
+        description="fewer triangles, at samples of both no farther than this (mm) from the full surface",
     )
 
 

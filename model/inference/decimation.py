@@ -28,6 +28,7 @@ MOST_FOLDS = 8
 def decimated(mesh: Mesh, max_error_mm: float) -> Mesh:
     """A mesh of fewer faces whose Hausdorff distance to the given one is at most a bound; watertight as that one.
 
+    The distance is measured at samples (`hausdorff_mm`); between them it may be larger by a part of their spacing.
     Normals are those of the faces; scalars are taken from the nearest vertex.
 
     Args:

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from model.bundle import ShapeModel
 from model.errors import MorphoFlowError
-from model.inference.reconstruction import Watch
+from model.inference.reconstruction import Watch, unwatched
 from model.interruption import Check, unchecked
 from service.errors import Abandoned, HelperLost
 from service.observability import Log
@@ -51,10 +51,6 @@ class Models(Protocol):
 
 #: Opens a helper's models; goes to it through a pipe.
 OpenModels = Callable[[], Models]
-
-
-def unwatched(_: str) -> None:
-    """A `Watch` that does nothing."""
 
 
 def compute_here(

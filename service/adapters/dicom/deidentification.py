@@ -154,6 +154,13 @@ def cleared(file: StudyFile) -> bytes | LeftOut:
     return buffer.getvalue()
 
 
+def without_pixels(content: Dataset) -> Dataset:
+    """An image alone with where it lies, which is all that drawings on it ask; drawings stay whole."""
+    if content.get("SOPClassUID") not in DRAWINGS and "PixelData" in content:
+        del content.PixelData
+    return content
+
+
 def label_maps(study: Sequence[StudyFile], limits: ImageLimits) -> Iterator[LabelMap | LeftOut]:
     """Each drawing of a study as label maps on its images' grid, or why there is none.
 

@@ -8,6 +8,7 @@ import pytest
 from pydicom import Dataset, dcmread
 from pydicom.sequence import Sequence as Items
 
+from service.adapters.dicom.deidentification import without_pixels
 from tests.dicom_parts import file_bytes, mr_series, reread, ring, rtstruct_of, seg_of, with_region
 from tests.unit.service.test_dicom_commands import SIZE, TYPED, run
 
@@ -103,3 +104,10 @@ def test_each_region_has_a_number_of_its_own_and_no_name_is_told(tmp_path, capsy
     assert np.unique(mask).tolist() == [0, 1, 2]
     assert np.argwhere(mask == 1)[:, 0].max() < np.argwhere(mask == 2)[:, 0].min()
     assert TYPED not in json.dumps(done) + told
+
+
+def test_images_are_kept_without_pixels_and_drawings_whole():
+    images = mr_series(SIZE)
+    drawing = seg_of(images, np.ones((*SIZE, 1), np.uint8))
+    assert "PixelData" not in without_pixels(reread(images[0]))
+    assert "PixelData" in without_pixels(reread(drawing))
