@@ -152,7 +152,7 @@ def uncalibrated_share(model: ShapeModel) -> ShapeModel:
 
 
 def with_share(model: ShapeModel, cases: Sequence[Case], advance: Advance = lambda: None) -> ShapeModel:
-    """The model with the least weight of completed drawings that brings surfaces nearest to the masks."""
+    """The model with the weight of completed drawings that brings surfaces nearest to the masks."""
     chosen = answerable_cases(evenly(cases, WEIGHED_CASES), REGIMES)
     distances: dict[float, float] = {}
     for share in SHARES:
@@ -161,7 +161,7 @@ def with_share(model: ShapeModel, cases: Sequence[Case], advance: Advance = lamb
             np.mean([reconstruction_error_mm(trial, case, regime) for case in chosen for regime in drawings_of(case)])
         )
         advance()
-    best = min(share for share in SHARES if distances[share] <= (1.0 + TIE) * min(distances.values()))
+    best = min(distances, key=lambda share: distances[share])
     facts = {"asd_mm_by_share": {f"{share:g}": mm for share, mm in distances.items()}}
     return changed(counting(model, best), calibration={**model.manifest.calibration, **facts})
 
