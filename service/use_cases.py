@@ -22,7 +22,7 @@ from model.inference.posterior_shapes import PosteriorShape, draw_posterior
 from model.inference.reconstruction import SURFACE_SD, Options, Watch, farthest_mm, unwatched
 from model.inference.reconstruction import reconstruct as infer
 from model.inference.sampling import SampledShape, draw_shape
-from model.inference.stacks import require_labels, require_length
+from model.inference.stacks import label_warnings, require_length
 from model.inference.surface import covering_grid, require_step
 from model.inference.uncertainty import ShapeState, voxel_entropy
 from model.interruption import Check, interruptible, unchecked
@@ -59,7 +59,9 @@ def reconstruct(
     manifest = model.manifest
     figure_ml, judged_mm = reconstruction.volume_ml.value, manifest.resolution_mm
     coarse = coarse_cautions(reconstruction.mesh, options.resolution_mm, figure_ml, judged_mm)
-    told = replace(reconstruction, warnings=(*reconstruction.warnings, *notes_of(stacks), *coarse))
+    told = replace(
+        reconstruction, warnings=(*reconstruction.warnings, *notes_of(stacks), *label_warnings(stacks), *coarse)
+    )
     return Outcome(manifest.name, manifest.version, model.digest, options, stacks[0].grid, told)
 
 
@@ -73,7 +75,7 @@ def stacks_of(
     """The stacks of all masks of one drawing in their order; the check is passed before each mask.
 
     Raises:
-        InputError: a mask cannot be used, or none holds a label; names it as ``mask[0]``, ``mask[1]`` and so on.
+        InputError: a mask cannot be used; names it as ``mask[0]``, ``mask[1]`` and so on.
         TooLarge: they have more voxels together than allowed.
     """
     stacks: list[MaskStack] = []
@@ -86,7 +88,6 @@ def stacks_of(
                 f"The masks up to {part} have more than {max_voxels} voxels together, the most that is accepted.",
                 part=part,
             )
-    require_labels(stacks)
     return tuple(stacks)
 
 

@@ -79,14 +79,14 @@ def checked_labels(labels: frozenset[int] | None) -> None:
         raise InvalidParameter("label must name at least one value, and positive integers only", part="label")
 
 
-def require_labels(stacks: Sequence[MaskStack]) -> None:
-    """Refuse labels of the object that none of its stacks holds: `InvalidMask`."""
+def label_warnings(stacks: Sequence[MaskStack]) -> tuple[str, ...]:
+    """What to tell of labels of the object that none of its stacks holds, though they hold others."""
     absent = frozenset[int].intersection(*(stack.absent for stack in stacks)) if stacks else frozenset[int]()
-    if absent:
-        part = stacks[0].part if len(stacks) == 1 else "mask"
-        raise InvalidMask(
-            f"{part} does not hold label {_listed(sorted(absent))}; labels that are there are accepted", part=part
-        )
+    if not absent:
+        return ()
+    name = stacks[0].part if len(stacks) == 1 else "No mask"
+    verb = "does not hold" if len(stacks) == 1 else "holds"
+    return (f"{name} {verb} label {_listed(sorted(absent))}; the object is what carries the other labels.",)
 
 
 def require_length(stacks: Sequence[MaskStack], longest_mm: float) -> None:

@@ -191,11 +191,15 @@ def test_of_several_files_a_warning_names_the_one_it_means(visit, repository):
     planes = [{"stack": stack, "axis": 2, "index": 14} for stack in (0, 1)]
     told_instead(visit, warnings=["The drawing on mask[1] axis 2 index 14 disagrees."], planes=planes)
     visit.go()
-    drop(visit, (repository / EXAMPLE).read_bytes(), "left.nii.gz", "right.nii.gz")
+    example = nib.load(repository / EXAMPLE)
+    beside = example.affine.copy()
+    beside[:3, 3] += 0.4
+    drop(visit, (repository / EXAMPLE).read_bytes(), "left.nii.gz")
+    drop(visit, nib.Nifti1Image(np.asarray(example.dataobj), beside).to_bytes(), "right.nii")
     expect(visit.page.get_by_text("6 annotated planes found")).to_be_visible()
-    visit.page.get_by_label("Which file is shown").select_option("right.nii.gz")
+    visit.page.get_by_label("Which file is shown").select_option("right.nii")
     reconstruct(visit)
-    expect(visit.shown(".warnings")).to_contain_text("axial slice 15 of 34 of right.nii.gz")
+    expect(visit.shown(".warnings")).to_contain_text("axial slice 15 of 34 of right.nii")
     visit.page.get_by_text("Agreement with each").click()
     expect(visit.shown(".residuals")).to_contain_text("Axial 15 of left.nii.gz")
 

@@ -44,7 +44,7 @@ def test_a_file_in_place_of_a_text_is_told_how_to_send_one(client, name):
 @pytest.mark.parametrize(
     ("parts", "told"),
     [
-        ([("mask", ("m", b"1"))] * 1001, "At most 8 parts named mask"),
+        ([("mask", ("m", b"1"))] * 1001, "At most 8 files are accepted"),
         ([("mask", ("m", b"1")), *[("label", (None, "1"))] * 1001], "64 parts that are no file"),
         ([("mask", ("m", b"1")), ("annotated", (None, "a" * (2**20 + 1)))], "1024 KiB"),
     ],

@@ -92,7 +92,9 @@ def test_a_part_that_is_no_list_is_sent_once(client, name, value):
 
 def test_lists_are_sent_as_often_as_one_likes(client):
     both = [*mask_parts(), ("label", (None, "1")), ("label", (None, "2")), ("uncertainty", (None, "none"))]
-    assert client.post(RECONSTRUCTIONS, files=both).status_code == 201
+    answer = client.post(RECONSTRUCTIONS, files=both)
+    assert answer.status_code == 201
+    assert any("mask[0] does not hold label 2" in warning for warning in answer.json()["warnings"])
     assert client.get(f"/v1/models/{NAME}/shape?mode=1:1&mode=2:1").status_code == 200
 
 
