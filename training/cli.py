@@ -22,7 +22,7 @@ from training.choices import (
     anatomy_code,
     resolved,
 )
-from training.cohort_options import opened_cohort, takes_cohort
+from training.cohort_options import opened_cohort, require_use, takes_cohort
 from training.cohorts import Cohort, CohortOptions
 from training.cohorts.sources import CohortSource
 from training.console import JsonOption, check_output, exit_status, finding_counts, progress, tell_findings, warn
@@ -176,12 +176,7 @@ def export(
         check_output(output, is_folder=True)
         choice = ExportChoice(prune, least_movement, training_share, by_cohort=source.is_given)
         parts = choice.parts(stood_still=wants_prior(run))
-        if not source.is_given and (source.align or options != CohortOptions()):
-            raise InvalidParameter(
-                "--align, --seed, --test-fraction, --skip-refused and --shippable would do nothing here; they go with "
-                "--cohort, --masks and --meshes.",
-                part="cohort",
-            )
+        require_use(source, options)
         if parts is not None and source.is_given:
             parts = _parts_for(run, parts, source, options)
         manifest = _exported_with_progress(run, output, parts, naming)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
+from model.errors import InvalidParameter
 from training.cohorts import Cohort, CohortName, CohortOptions
 from training.cohorts.catalogue import DATA_VARIABLE
 from training.cohorts.cohort import SideName
@@ -67,6 +68,16 @@ def takes_cohort(command: Command) -> Command:
     call.__annotations__ = {one.name: one.annotation for one in parameters}
     call.__name__, call.__doc__ = command.__name__, command.__doc__
     return call
+
+
+def require_use(source: CohortSource, options: CohortOptions) -> None:
+    """Refuse options of a cohort where none was named: `InvalidParameter`."""
+    if not source.is_given and (source.align or options != CohortOptions()):
+        raise InvalidParameter(
+            "--align, --seed, --test-fraction, --skip-refused and --shippable would do nothing here; they go with "
+            "--cohort, --masks and --meshes.",
+            part="cohort",
+        )
 
 
 def opened_cohort(source: CohortSource, options: CohortOptions) -> Cohort:

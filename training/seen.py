@@ -39,14 +39,11 @@ def check_unseen(manifest: Manifest, cases: Sequence[Case], measured: str = "val
     Raises:
         InvalidParameter: the model was trained on one of the cases.
     """
-    known = set(manifest.training_masks)
-    seen = [case.name for case in cases if known and is_among(case, known)]
-    if seen:
-        raise InvalidParameter(
-            f"The model was trained on {listed(seen)}, which is to be among the {measured} cases; --seed and "
-            "--test-fraction of the training, or a model of train --test-fraction, are accepted.",
-            part="cohort",
-        )
+    _refuse(
+        _known(manifest.training_masks, cases),
+        f"The model was trained on {{}}, which is to be among the {measured} cases; --seed and --test-fraction of the "
+        "training, or a model of train --test-fraction, are accepted.",
+    )
 
 
 def check_uncalibrated(manifest: Manifest, cases: Sequence[Case]) -> None:
@@ -56,14 +53,11 @@ def check_uncalibrated(manifest: Manifest, cases: Sequence[Case]) -> None:
         InvalidParameter: it was calibrated on one of the cases.
     """
     masks = manifest.calibration.get("masks")
-    known = set(masks) if isinstance(masks, tuple | list) else set()
-    seen = [case.name for case in cases if known and is_among(case, known)]
-    if seen:
-        raise InvalidParameter(
-            f"The model was calibrated on {listed(seen)}, which is to be among the test cases; the same --seed and "
-            "--test-fraction for train, export, calibrate and evaluate are accepted.",
-            part="cohort",
-        )
+    _refuse(
+        _known(masks if isinstance(masks, tuple | list) else (), cases),
+        "The model was calibrated on {}, which is to be among the test cases; the same --seed and --test-fraction for "
+        "train, export, calibrate and evaluate are accepted.",
+    )
 
 
 def check_seen(manifest: Manifest, cases: Sequence[Case]) -> None:
@@ -72,11 +66,21 @@ def check_seen(manifest: Manifest, cases: Sequence[Case]) -> None:
     Raises:
         InvalidParameter: the model was not trained on one of the cases.
     """
-    known = set(manifest.training_masks)
-    other = [case.name for case in cases if known and not is_among(case, known)]
-    if other:
-        raise InvalidParameter(
-            f"The model was not trained on {listed(other)}, which the network would learn from; shapes, --seed and "
-            "--test-fraction of the training are accepted.",
-            part="cohort",
-        )
+    known = set(_known(manifest.training_masks, cases))
+    other = [case.name for case in cases if manifest.training_masks and case.name not in known]
+    _refuse(
+        other,
+        "The model was not trained on {}, which the network would learn from; shapes, --seed and --test-fraction of "
+        "the training are accepted.",
+    )
+
+
+def _known(digests: Collection[str], cases: Sequence[Case]) -> list[str]:
+    """Names of the cases that are among those with these digests."""
+    looked_up = set(digests)
+    return [case.name for case in cases if looked_up and is_among(case, looked_up)]
+
+
+def _refuse(names: Sequence[str], sentence: str) -> None:
+    if names:
+        raise InvalidParameter(sentence.format(listed(names)), part="cohort")

@@ -1,5 +1,6 @@
 """Which planes of the stacks were looked at: by a rule of the interface, or by name."""
 
+from collections import Counter
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Literal
@@ -11,7 +12,7 @@ from model.errors import InconsistentStacks, InvalidMask, InvalidParameter
 from model.geometry import Grid
 from model.inference.mask_stack import MaskStack, Plane, index_box, occupied, section_of, world_box
 from model.inference.plane_cover import cover_planes
-from model.inference.repeats import looked_at, repeats
+from model.inference.repeats import each_place_once, looked_at
 from model.inference.stacks import EXCLUDED_VALUE
 
 AnnotatedRule = Literal["auto", "all", "nonempty"]
@@ -48,28 +49,26 @@ def find_planes(
             named.
         InconsistentStacks: the foreground of some stacks over `gap_mm` from that of all others.
     """
+    return planes_and_repeats(stacks, rule, gap_mm)[0]
+
+
+def planes_and_repeats(
+    stacks: Sequence[MaskStack], rule: AnnotatedRule | Sequence[Plane], gap_mm: float = WORLD_GAP_MM
+) -> tuple[tuple[Plane, ...], tuple[Plane, ...]]:
+    """What `find_planes` finds, and the planes that do not count because an earlier stack shows their places."""
     _check_same_world(stacks, gap_mm)
-    planes = _all_planes(stacks, rule)
-    again = repeats(stacks, planes)
-    planes = tuple(plane for plane in planes if plane not in again)
+    planes, again = each_place_once(stacks, _all_planes(stacks, rule))
     if not any(section_of(stacks[p.stack].foreground, p).any() for p in planes):
         raise InvalidMask("mask holds no foreground on its annotated planes; at least one voxel is needed", part="mask")
-    return planes
+    return planes, again
 
 
-def repeat_warnings(
-    stacks: Sequence[MaskStack], rule: AnnotatedRule | Sequence[Plane], counted: Sequence[Plane]
-) -> tuple[str, ...]:
-    """What to tell about planes that do not count because an earlier stack shows their places.
-
-    Args:
-        counted: by the same rule.
-    """
-    repeated = [plane.stack for plane in _all_planes(stacks, rule) if plane not in counted] if len(stacks) > 1 else []
+def repeat_warnings(stacks: Sequence[MaskStack], again: Sequence[Plane]) -> tuple[str, ...]:
+    """What to tell about the second planes of `planes_and_repeats`."""
     return tuple(
-        f"{stacks[number].part} shows {repeated.count(number)} plane(s) that an earlier mask shows too; the first "
-        "drawing of a place counts."
-        for number in sorted(set(repeated))
+        f"{stacks[number].part} shows {count} plane(s) that an earlier mask shows too; the first drawing of a place "
+        "counts."
+        for number, count in sorted(Counter(plane.stack for plane in again).items())
     )
 
 

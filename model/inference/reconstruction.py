@@ -14,7 +14,7 @@ from model.bundle import ShapeModel
 from model.errors import InvalidMask, InvalidParameter
 from model.geometry import Space
 from model.inference.agreement import disagreeing_planes, plane_warnings, sections_of
-from model.inference.annotated_planes import repeat_warnings
+from model.inference.annotated_planes import planes_and_repeats, repeat_warnings
 from model.inference.calipers import USUAL_EXTENTS, Extent, direction_of, measure_extents
 from model.inference.coverage import coverage_warnings
 from model.inference.discrepancy.conditioning import DiscrepancyPrior, corrected, discrepancy_prior, observed_anew
@@ -24,7 +24,7 @@ from model.inference.fitting import Fit, FitOptions, MirrorRule, fit
 from model.inference.mask_stack import common_space
 from model.inference.mesh import Mesh
 from model.inference.objective import Place, reweighted
-from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, find_planes, observe
+from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, observe
 from model.inference.one_body import separate_warnings
 from model.inference.posterior import FieldDerivatives, fitted_logits, laplace_covariance
 from model.inference.reliability import figures_of, less_trusting, reliability_warnings, thickness_warnings
@@ -160,7 +160,7 @@ def reconstruct(
     _check(options)
     _require_room(model, options, max_voxels)
     watch("observations")
-    planes = find_planes(stacks, options.annotated, farthest_mm(model))
+    planes, again = planes_and_repeats(stacks, options.annotated, farthest_mm(model))
     drawing = observe(stacks, planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=options.seed)
     watch("fit")
     usual = discrepancy_prior(model.manifest)
@@ -203,7 +203,7 @@ def reconstruct(
         extents=measure_extents(mesh, spread, options.extents, space),
         log_prior_density=density,
         typicality_percentile=percentile,
-        warnings=repeat_warnings(stacks, options.annotated, planes)
+        warnings=repeat_warnings(stacks, again)
         + _warnings(found, options)
         + separate_warnings(observations, logits, mesh)
         + rival_warnings(found)

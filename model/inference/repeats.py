@@ -5,35 +5,44 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from model.geometry import Grid
 from model.inference.mask_stack import MaskStack, Plane, box_corners, index_box
 
 #: Planes of one place are parallel to within this sine, as thick and no farther apart than this share of that.
 SAME_DIRECTION, SAME_PLACE = 0.01, 0.1
 
 
-def repeats(stacks: Sequence[MaskStack], planes: Sequence[Plane]) -> set[Plane]:
-    """Planes of which an earlier stack shows all that was looked at, in the same place and as thick."""
+def each_place_once(
+    stacks: Sequence[MaskStack], planes: Sequence[Plane]
+) -> tuple[tuple[Plane, ...], tuple[Plane, ...]]:
+    """The planes without those of which an earlier stack shows all that was looked at, and those.
+
+    Planes show the same where they lie in the same place and are as thick.
+    """
     if len({plane.stack for plane in planes}) < 2:
-        return set()
+        return tuple(planes), ()
     grids = [stacks[plane.stack].grid for plane in planes]
+    number = np.array([plane.stack for plane in planes])
     across = np.stack([grid.directions[:, plane.axis] for grid, plane in zip(grids, planes, strict=True)])
     thick = np.array([grid.spacing[plane.axis] for grid, plane in zip(grids, planes, strict=True)])
-    middle = np.stack([looked_at(stacks[plane.stack], plane).mean(axis=0) for plane in planes])
-    found: set[Plane] = set()
-    for number, plane in enumerate(planes):
-        same = np.array([other.stack < plane.stack for other in planes])
-        same &= np.linalg.norm(np.cross(across, across[number]), axis=1) < SAME_DIRECTION
-        same &= np.abs((middle - middle[number]) @ across[number]) < SAME_PLACE * thick[number]
-        same &= np.abs(thick - thick[number]) < SAME_PLACE * thick[number]
-        if any(_holds(stacks, planes[other], plane) for other in np.flatnonzero(same).tolist()):
-            found.add(plane)
-    return found
+    boxes = np.stack([looked_at(stacks[plane.stack], plane) for plane in planes])
+    middle = boxes.mean(axis=1)
+
+    def is_repeat(one: int) -> bool:
+        same = number < number[one]
+        same &= np.linalg.norm(np.cross(across, across[one]), axis=1) < SAME_DIRECTION
+        same &= np.abs((middle - middle[one]) @ across[one]) < SAME_PLACE * thick[one]
+        same &= np.abs(thick - thick[one]) < SAME_PLACE * thick[one]
+        return any(_holds(grids[other], boxes[other], boxes[one]) for other in np.flatnonzero(same).tolist())
+
+    is_again = [is_repeat(one) for one in range(len(planes))]
+    first = (plane for plane, again in zip(planes, is_again, strict=True) if not again)
+    return tuple(first), tuple(plane for plane, again in zip(planes, is_again, strict=True) if again)
 
 
-def _holds(stacks: Sequence[MaskStack], first: Plane, second: Plane) -> bool:
-    """Whether what was looked at on a plane lies within what was looked at on another one, to half a voxel."""
-    grid, low_high = stacks[first.stack].grid, looked_at(stacks[first.stack], first)
-    box, corners = grid.to_index(low_high), grid.to_index(looked_at(stacks[second.stack], second))
+def _holds(grid: Grid, first: Float[np.ndarray, "8 3"], second: Float[np.ndarray, "8 3"]) -> bool:
+    """Whether a box along the axes of a grid holds other corners (world mm), to half a voxel."""
+    box, corners = grid.to_index(first), grid.to_index(second)
     return bool((corners >= box.min(axis=0) - 0.5).all() and (corners <= box.max(axis=0) + 0.5).all())
 
 

@@ -41,7 +41,7 @@ class PosteriorWriter:
             "model": named_model(posterior.outcome),
             "reconstruction": identifier,
             "uncertainty": posterior.outcome.options.uncertainty,
-            **({"members": members} if (members := len(posterior.outcome.reconstruction.state.members)) else {}),
+            **_members(posterior),
             "space": _space(posterior),
             "unit": "mm",
             "format": self._format.value,
@@ -49,6 +49,12 @@ class PosteriorWriter:
             "samples": list(entries),
         }
         return json.dumps(document, indent=1).encode()
+
+
+def _members(posterior: Posterior) -> dict[str, int]:
+    """How many different draws there are, where they are the members of an ensemble."""
+    count = len(posterior.outcome.reconstruction.state.members)
+    return {"members": count} if count else {}
 
 
 def _space(posterior: Posterior) -> Space:

@@ -13,7 +13,7 @@ from typing import Any
 from model.errors import CohortError
 from training.cohorts.assemble import CohortOptions, assemble
 from training.cohorts.cohort import Cohort, Provenance, Refusal
-from training.cohorts.folder import absent, merged, read_cases, read_table, require_one_table
+from training.cohorts.folder import absent, merged, own_table, read_cases
 from training.cohorts.reading import is_mask_file, stem
 
 DESCRIPTION = "dataset.json"
@@ -35,8 +35,7 @@ def read_decathlon(folder: Path, options: CohortOptions, *, labels: Collection[i
         Refusal(stem(path), "the description lists it but its label is missing") for path in files if not path.is_file()
     ]
     tests = _files(folder / "labelsTs")
-    require_one_table(folder)
-    table = read_table(folder / "cases.csv")
+    table = own_table(folder)
     rows = merged({stem(path): {"split": "test"} for path in tests}, table)
     present = [path for path in files if path.is_file()]
     cases, refused = read_cases([*present, *tests], folder, rows, labels)

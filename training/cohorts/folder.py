@@ -2,8 +2,8 @@
 
 Columns of ``cases.csv`` that are read: ``case`` (file name without suffix), ``split`` (train, validation
 or test), ``person`` (or ``subject``, or ``patient``), ``source``, ``licence``. A file without a row, or a folder
-without the table, takes its split from the innermost folder on the way to it that is named train, validation or test, or by
-`ALSO_SPLITS`, or else train; its person is its own name. Sub-folders are searched as well.
+without the table, takes its split from the innermost folder on the way to it that is named after one (`SPLITS`), or
+else train; its person is its own name. Sub-folders are searched as well.
 """
 
 import csv
@@ -17,15 +17,16 @@ from training.cohorts.cohort import NOT_STATED, Case, Cohort, Provenance, Refusa
 from training.cohorts.reading import SUFFIXES, MaskFile, is_mask_file, read_mask, stem
 
 Row = Mapping[str, str]
-SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 #: Columns that say whose a case is, the first that is there; and what else is read.
 PERSON, READ = ("person", "subject", "patient"), ("case", "split", "source", "licence")
-#: Other usual names of the splits.
-ALSO_SPLITS: Mapping[str, Split] = {
-    **{split: split for split in SPLITS},
+#: Splits by the names that folders and tables may give them, in small letters.
+SPLITS: Mapping[str, Split] = {
+    "train": "train",
     "training": "train",
+    "validation": "validation",
     "val": "validation",
     "valid": "validation",
+    "test": "test",
     "testing": "test",
 }
 #: Formats of tables, and of images and label maps, that are not read.
@@ -52,13 +53,28 @@ def read_folder(
     """
     if not folder.is_dir():
         raise CohortError("The folder of masks does not exist; an existing folder is accepted.")
-    require_one_table(folder)
-    rows = read_table(folder / "cases.csv")
+    rows = own_table(folder)
     found = [path for path in folder.rglob("*") if path.is_file()]
     files = sorted(path for path in found if is_mask_file(path))
     cases, refused = read_cases(files, folder, rows, labels)
     refused += [*absent(rows, map(stem, files)), *unread_files(found, OTHER_IMAGES, ", ".join(SUFFIXES))]
     return assemble(name or folder.resolve().name, cases, refused, provenance, options, side=side)
+
+
+def own_table(folder: Path, *, persons: bool = True) -> dict[str, Row]:
+    """Rows of the one table ``cases.csv`` at the top of a folder by case; see `read_table`.
+
+    Raises:
+        CohortError: also when there is a table elsewhere in the folder, which would not be read.
+    """
+    tables = [path for path in folder.rglob("*") if path.suffix.lower() in TABLES and path.stem.lower() == "cases"]
+    unread = [path.relative_to(folder).as_posix() for path in tables if path != folder / "cases.csv"]
+    if unread:
+        raise CohortError(
+            f"The folder holds {listed(sorted(unread))}, which is not read; one table cases.csv, at the top of the "
+            "folder, is accepted."
+        )
+    return read_table(folder / "cases.csv", persons=persons)
 
 
 def read_table(path: Path, keep: Callable[[Row], bool] = lambda row: True, *, persons: bool = True) -> dict[str, Row]:
@@ -88,7 +104,7 @@ def read_table(path: Path, keep: Callable[[Row], bool] = lambda row: True, *, pe
         raise CohortError(
             "The table of cases has a row without a case or a case twice; one row for each case is accepted."
         )
-    unknown = sorted({row["split"] for row in rows if row.get("split")} - set(ALSO_SPLITS))
+    unknown = sorted({row["split"] for row in rows if row.get("split")} - set(SPLITS))
     if unknown:
         raise CohortError(
             f"The table of cases names an unknown split, {listed(unknown)}; train, validation or test is accepted."
@@ -99,7 +115,7 @@ def read_table(path: Path, keep: Callable[[Row], bool] = lambda row: True, *, pe
             f"The table of cases has no column person, and {listed(unread)} is not read, so that cases of one person "
             "could stand in several splits; a column person, subject or patient is accepted."
         )
-    read = ({**row, "split": ALSO_SPLITS[row["split"]]} if row.get("split") else row for row in rows)
+    read = ({**row, "split": SPLITS[row["split"]]} if row.get("split") else row for row in rows)
     return {row["case"]: row for row in read if keep(row)}
 
 
@@ -138,17 +154,6 @@ def absent(rows: Iterable[str], known: Iterable[str]) -> list[Refusal]:
     """
     reason = "the table lists it but its file is missing; names of files without their suffix are accepted"
     return [Refusal(case, reason) for case in sorted(set(rows) - set(known))]
-
-
-def require_one_table(folder: Path) -> None:
-    """Refuse a table of cases that would not be read: `CohortError`."""
-    tables = [path for path in folder.rglob("*") if path.suffix.lower() in TABLES and path.stem.lower() == "cases"]
-    unread = [path.relative_to(folder).as_posix() for path in tables if path != folder / "cases.csv"]
-    if unread:
-        raise CohortError(
-            f"The folder holds {listed(sorted(unread))}, which is not read; one table cases.csv, at the top of the "
-            "folder, is accepted."
-        )
 
 
 def unread_files(files: Iterable[Path], suffixes: Collection[str], accepted: str) -> list[Refusal]:
@@ -201,4 +206,4 @@ def _case(path: Path, root: Path, row: Row, found: MaskFile) -> Case:
 def split_by_folder(path: Path, root: Path) -> Split:
     """Split of a file by the innermost folder below the root that is named after one, train when none is."""
     folders = [part.lower() for part in path.relative_to(root).parts[:-1]]
-    return next((ALSO_SPLITS[part] for part in reversed(folders) if part in ALSO_SPLITS), "train")
+    return next((SPLITS[part] for part in reversed(folders) if part in SPLITS), "train")

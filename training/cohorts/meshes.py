@@ -32,7 +32,7 @@ from model.errors import CohortError, InvalidMask, UnreadableImage
 from model.geometry import Grid
 from training.cohorts.assemble import CohortOptions, assemble
 from training.cohorts.cohort import Cohort, Provenance
-from training.cohorts.folder import absent, read_cases, read_table, require_one_table, unread_files
+from training.cohorts.folder import absent, own_table, read_cases, unread_files
 from training.cohorts.inspect import EXTENT_RANGE_MM
 from training.cohorts.reading import MaskFile, stem
 from training.cohorts.voxelising import SpaceName, Voxelising
@@ -66,8 +66,7 @@ def read_meshes(folder: Path, options: CohortOptions, *, how: Voxelising = ONE_M
     """
     if not folder.is_dir():
         raise CohortError("The folder of meshes does not exist; an existing folder is accepted.")
-    require_one_table(folder)
-    rows = read_table(folder / "cases.csv")
+    rows = own_table(folder)
     found = [path for path in folder.rglob("*") if path.is_file()]
     files = sorted(path for path in found if is_mesh_file(path))
     if not files:
@@ -151,24 +150,29 @@ def voxelised(surface: Any, how: Voxelising, name: str) -> MaskFile:
     return MaskFile(mask, Grid((int(shape[0]), int(shape[1]), int(shape[2])), affine))
 
 
-def _filled(surface: Any, lower: Float[np.ndarray, "3"], shape: Any, spacing_mm: float, name: str) -> Any:
+def _filled(
+    surface: Any, lower: Float[np.ndarray, "3"], shape: Int[np.ndarray, "3"], spacing_mm: float, name: str
+) -> Bool[np.ndarray, "i j k"]:
     """What the closed parts of a surface enclose: those inside others are cavities, or lie in these.
 
     Raises:
         InvalidMask: parts that overlap, of which it is not said what they enclose together.
     """
-    parts = _parts(surface)
-    if len(parts) == 1:
-        return _stencil(surface, lower, shape, spacing_mm)
     inside = np.zeros(tuple(shape), bool)
-    for part in parts:
-        own = _stencil(part, lower, shape, spacing_mm)
-        common = own & inside
+    for part in _parts(surface):
+        reach = (np.reshape(part.GetBounds(), (3, 2)).T - lower) / spacing_mm
+        first, stop = (
+            np.maximum(np.floor(reach[0]).astype(int), 0),
+            np.minimum(np.ceil(reach[1]).astype(int) + 1, shape),
+        )
+        around = inside[tuple(slice(a, b) for a, b in zip(first, stop, strict=True))]
+        own = _stencil(part, lower + first * spacing_mm, stop - first, spacing_mm)
+        common = own & around
         if common.any() and not np.array_equal(common, own):
             raise InvalidMask(
                 "the mesh has closed parts that overlap; parts inside or beside each other are accepted", part=name
             )
-        inside ^= own
+        around ^= own
     return inside
 
 
@@ -217,7 +221,9 @@ def _quiet() -> Iterator[None]:
         vtkObject.SetGlobalWarningDisplay(shown)
 
 
-def _stencil(surface: Any, lower: Float[np.ndarray, "3"], shape: Any, spacing_mm: float) -> Bool[np.ndarray, "i j k"]:
+def _stencil(
+    surface: Any, lower: Float[np.ndarray, "3"], shape: Int[np.ndarray, "3"], spacing_mm: float
+) -> Bool[np.ndarray, "i j k"]:
     image = vtkImageData()
     image.SetOrigin(*lower.tolist())
     image.SetSpacing(spacing_mm, spacing_mm, spacing_mm)

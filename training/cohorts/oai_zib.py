@@ -14,7 +14,7 @@ from pathlib import Path
 from model.errors import CohortError
 from training.cohorts.assemble import CohortOptions, assemble
 from training.cohorts.cohort import Cohort, Provenance, Refusal
-from training.cohorts.folder import absent, merged, read_cases, read_table, require_one_table
+from training.cohorts.folder import absent, merged, own_table, read_cases
 from training.cohorts.reading import is_mask_file, stem
 
 FEMUR = (1,)
@@ -39,8 +39,7 @@ def read_oai_zib(folder: Path, options: CohortOptions, *, labels: Collection[int
             "The folder holds no mask that is named after a participant (seven digits); those of OAI-ZIB are accepted."
         )
     known = {stem(path): {"person": path.name[:7]} for path in files}
-    require_one_table(folder)
-    table = read_table(folder / "cases.csv", persons=False)
+    table = own_table(folder, persons=False)
     rows = merged(known, {name: table.get(name, table.get(row["person"], {})) for name, row in known.items()})
     cases, refused = read_cases(files, folder, rows, labels or FEMUR)
     refused += absent(table, (*known, *(row["person"] for row in known.values())))

@@ -32,10 +32,10 @@ def filled(sheet: Sequence[Contour], grid: Grid, part: str) -> Bool[np.ndarray, 
     regions: dict[int, dict[bytes, Contour]] = defaultdict(dict)
     for contour in sheet:
         regions[contour.region].setdefault(_identity(contour), contour)
-    filled = np.zeros(grid.shape[:2], bool)
+    inside = np.zeros(grid.shape[:2], bool)
     for contours in regions.values():
-        filled |= _filled_region(list(contours.values()), grid, part)
-    return filled
+        inside |= _filled_region(list(contours.values()), grid, part)
+    return inside
 
 
 def _identity(contour: Contour) -> bytes:
@@ -55,10 +55,10 @@ def _filled_region(contours: Sequence[Contour], grid: Grid, part: str) -> Bool[n
             crossed ^= mask
         else:
             nest.add(contour, mask)
-    filled = nest.filled ^ crossed
+    inside = nest.filled ^ crossed
     for column, row in specks:
-        filled[column, row] = True
-    return filled
+        inside[column, row] = True
+    return inside
 
 
 def _enclosed(contour: Contour, grid: Grid) -> Bool[np.ndarray, "i j"]:

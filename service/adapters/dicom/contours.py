@@ -14,14 +14,14 @@ from service.adapters.image_guard import LPS_TO_RAS
 
 #: Geometric types that enclose an area; of the second one those of a region and plane take each other away.
 CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
-#: Numbers of a contour's data below which it encloses nothing.
-SMALLEST_CONTOUR = 9
+#: Points below which a contour encloses nothing.
+FEWEST_POINTS = 3
 #: A contour has no area where twice its area through its extent is less than this (mm).
 NARROWEST_MM = 1e-3
 #: Distance of a contour's points from their common plane that is tolerated (mm).
 FLATNESS_MM = 0.1
-#: Contours, and points in them, that the regions which are read together have at most.
-MOST_CONTOURS, MOST_POINTS = 1 << 16, 1 << 22
+#: Closed contours, points in one of them and in all, that the regions which are read together have at most.
+MOST_CONTOURS, MOST_OF_ONE, MOST_POINTS = 1 << 16, 1 << 18, 1 << 22
 
 
 @dataclass(frozen=True)
@@ -114,21 +114,23 @@ def _drawn_regions(
     """
     drawn: dict[int, list[tuple[Dataset, Float[np.ndarray, "n 3"]]]] = defaultdict(list)
     known = {int(region.ROINumber) for region in found.get("StructureSetROISequence") or []}
-    contours = numbers = 0
+    contours = points = 0
     for region in found.get("ROIContourSequence") or []:
         number = int(region.ReferencedROINumber)
         known.add(number)
         for item in region.get("ContourSequence") or [] if labels is None or number in labels else []:
-            data = _numbers(item)
-            contours, numbers = contours + 1, numbers + len(data)
-            if contours > MOST_CONTOURS or numbers > 3 * MOST_POINTS:
+            if item.ContourGeometricType not in CLOSED:
+                continue
+            own = _count(item) // 3
+            contours, points = contours + 1, points + own
+            if contours > MOST_CONTOURS or own > MOST_OF_ONE or points > MOST_POINTS:
                 raise TooLarge(
-                    f"{part} has more than {MOST_CONTOURS} contours or {MOST_POINTS} points in them, the most that are "
-                    "accepted; choose regions, or draw them with fewer points",
+                    f"{part} has more than {MOST_CONTOURS} closed contours, {MOST_OF_ONE} points in one or "
+                    f"{MOST_POINTS} in all, the most that are accepted; choose regions, or draw them with fewer points",
                     part=part,
                 )
-            if item.ContourGeometricType in CLOSED and _has_area(data):
-                drawn[number].append((item, data.reshape(-1, 3)))
+            if own >= FEWEST_POINTS and _has_area(data := _points(item)):
+                drawn[number].append((item, data))
     if labels is not None and not labels <= known:
         raise InvalidMask(
             f"{part} has no region {listed(labels - known)}; regions that are there: {listed(known) or 'none'}",
@@ -137,16 +139,19 @@ def _drawn_regions(
     return dict(drawn)
 
 
-def _numbers(item: Dataset) -> Float[np.ndarray, "n"]:
-    """A contour's data, read at once: number by number the library would take forty times the room."""
+def _count(item: Dataset) -> int:
+    """How many numbers a contour's data holds, before one of them is read."""
     value = item.get_item("ContourData").value
-    return np.array(value.split(b"\\") if isinstance(value, bytes) else value, float)
+    return value.count(b"\\") + 1 if isinstance(value, bytes) and value else len(value or ())
 
 
-def _has_area(data: Float[np.ndarray, "n"]) -> bool:
-    if len(data) < SMALLEST_CONTOUR:
-        return False
-    points = data.reshape(-1, 3)
+def _points(item: Dataset) -> Float[np.ndarray, "n 3"]:
+    """A contour's points (mm), read at once: number by number the library would take forty times the room."""
+    value = item.get_item("ContourData").value
+    return np.array(value.split(b"\\") if isinstance(value, bytes) else value, float).reshape(-1, 3)
+
+
+def _has_area(points: Float[np.ndarray, "n 3"]) -> bool:
     extent_mm = max(np.ptp(points, axis=0).max(), NARROWEST_MM)
     return not np.linalg.norm(_twice_area(points)) < NARROWEST_MM * extent_mm
 

@@ -1,25 +1,21 @@
-"""Planes of image frames and how they lie together: from LPS to voxel grids in RAS (PS3.3, C.7.6.2, C.7.6.16).
+"""How planes of image frames lie together: from LPS to voxel grids in RAS (PS3.3, C.7.6.2).
 
 Pixels are counted along a row first: index axes are column, row and plane, as in the voxel grids of
 `model.geometry`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from pydicom import Dataset
 
-from model.errors import InvalidGeometry, TooLarge
+from model.errors import InvalidGeometry
 from model.geometry import Grid, slab
-from service.adapters.dicom.objects import tolerant
+from service.adapters.dicom.frame_planes import FramePlane
+from service.adapters.dicom.plane_groups import REGULAR_SHARE, unlike_the_first
 from service.adapters.image_guard import LPS_TO_RAS
 
-#: Directions whose cosines differ by less than this are parallel (about 0.06 degrees).
-PARALLEL = 1e-3
-#: Share of a pixel or of the step by which planes may lie off their place in a stack, as rounded positions do.
-REGULAR_SHARE = 0.05
 #: Share by which the nominal distance of planes may be rounded.
 NOMINAL_SHARE = 0.01
 #: Distance of a drawn plane from its place that is rounded away (mm); also that of planes at one place.
@@ -34,11 +30,6 @@ MOST_PARTS = 10_000
 ROUNDING = 1e-6
 #: Planes named in a message, at most.
 LISTED_PLANES = 4
-#: Directions and places of which the planes of a drawing may be, at most.
-MOST_GROUPS = 512
-
-#: Whether each of some numbered things is like one of them.
-Alike = Callable[[int, Int[np.ndarray, "n"]], Bool[np.ndarray, "n"]]
 
 
 @dataclass(frozen=True)
@@ -46,33 +37,6 @@ class ImageGrid(Grid):
     """The voxel grid of images (RAS) and the frame of reference that its world is; empty when the images name none."""
 
     frame_of_reference: str = ""
-
-
-@dataclass(frozen=True)
-class FramePlane:
-    """Where one frame lies, in patient coordinates (LPS mm).
-
-    Attributes:
-        origin: centre of the first pixel.
-        row, column: unit vectors along a row (towards the next column) and along a column.
-        spacing: between columns and between rows (mm).
-        depth: nominal distance to the next plane (mm), NaN when unknown.
-    """
-
-    origin: Float[np.ndarray, "3"]
-    row: Float[np.ndarray, "3"]
-    column: Float[np.ndarray, "3"]
-    spacing: tuple[float, float]
-    depth: float
-
-    @property
-    def normal(self) -> Float[np.ndarray, "3"]:
-        """Unit vector across the plane."""
-        return np.asarray(np.cross(self.row, self.column))
-
-    def offset(self, other: "FramePlane") -> Float[np.ndarray, "3"]:
-        """Origin of another frame along row, column and normal of this one (mm)."""
-        return np.asarray(np.stack([self.row, self.column, self.normal]) @ (other.origin - self.origin))
 
 
 @dataclass(frozen=True)
@@ -87,106 +51,6 @@ class DrawnStack:
     grid: Grid
     numbers: Int[np.ndarray, "n"]
     places: Int[np.ndarray, "n"]
-
-
-def frame_planes(found: Dataset, part: str) -> list[FramePlane]:
-    """The plane of each frame, of single-frame images and of multi-frame functional groups.
-
-    Raises:
-        UnreadableImage: damaged.
-        InvalidGeometry: a frame without a plane in the patient's coordinates, as of a volume with coordinates of its
-            own, or with directions or spacings that no plane has.
-    """
-    with tolerant(part):
-        if "PerFrameFunctionalGroupsSequence" not in found:
-            return [_plane(found, found, found, part)]
-        shared = (found.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
-        return [_plane(*_macros(groups, shared), part) for groups in found.PerFrameFunctionalGroupsSequence]
-
-
-def _macros(frame: Dataset, shared: Dataset) -> tuple[Dataset, Dataset, Dataset]:
-    """Position, orientation and pixel measures of a frame, of its own or shared; empty where there are none."""
-    names = ("PlanePositionSequence", "PlaneOrientationSequence", "PixelMeasuresSequence")
-    position, orientation, measures = (
-        ((frame if name in frame else shared).get(name) or [Dataset()])[0] for name in names
-    )
-    return position, orientation, measures
-
-
-def _plane(position: Dataset, orientation: Dataset, measures: Dataset, part: str) -> FramePlane:
-    needed = (
-        (position, "ImagePositionPatient"),
-        (orientation, "ImageOrientationPatient"),
-        (measures, "PixelSpacing"),
-    )
-    if not all(holder.get(name) for holder, name in needed):
-        raise InvalidGeometry(
-            f"{part} has a frame without a plane in the patient's coordinates; frames with Image Position (Patient), "
-            "Image Orientation (Patient) and Pixel Spacing are accepted",
-            part=part,
-        )
-    origin = np.array(position.ImagePositionPatient, float)
-    row, column = np.array(orientation.ImageOrientationPatient, float).reshape(2, 3)
-    between_rows, between_columns = map(float, measures.PixelSpacing)
-    depth = float(measures.get("SpacingBetweenSlices") or measures.get("SliceThickness") or np.nan)
-    finite = np.isfinite([*origin, *row, *column, between_rows, between_columns]).all()
-    if not finite or min(between_rows, between_columns) <= 0 or not _orthonormal(row, column):
-        raise InvalidGeometry(
-            f"{part} has a frame whose directions or spacing are not those of a plane; "
-            "perpendicular unit vectors and positive spacings are accepted",
-            part=part,
-        )
-    return FramePlane(origin, row, column, (between_columns, between_rows), abs(depth))
-
-
-def _orthonormal(row: Float[np.ndarray, "3"], column: Float[np.ndarray, "3"]) -> bool:
-    gram = np.array([row @ row, column @ column, row @ column])
-    return bool(np.abs(gram - [1.0, 1.0, 0.0]).max() < PARALLEL)
-
-
-def parallel_groups(planes: Sequence[FramePlane], part: str) -> list[list[int]]:
-    """Numbers of the planes that can be one stack: parallel, of one spacing, in register.
-
-    Raises:
-        TooLarge: more than `MOST_GROUPS` stacks.
-    """
-    axes = np.array([[plane.row, plane.column] for plane in planes])
-    spacings, origins = np.array([plane.spacing for plane in planes]), np.array([plane.origin for plane in planes])
-
-    def alike(first: int, others: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-        turned = np.abs(axes[others] - axes[first]).max(axis=(1, 2)) <= PARALLEL
-        scaled = np.isclose(spacings[first], spacings[others], rtol=1e-3).all(axis=1)
-        shift = np.abs((origins[others] - origins[first]) @ axes[first].T) / spacings[first]
-        return np.asarray(turned & scaled & (shift.max(axis=1) <= REGULAR_SHARE))
-
-    return in_groups(len(planes), alike, part)
-
-
-def in_groups(count: int, alike: Alike, part: str) -> list[list[int]]:
-    """Numbers from 0 on, each in the first group whose first number it is like.
-
-    Raises:
-        TooLarge: more than `MOST_GROUPS` groups.
-    """
-    groups: list[list[int]] = []
-    rest = np.arange(count)
-    while len(rest):
-        if len(groups) == MOST_GROUPS:
-            raise TooLarge(
-                f"{part} draws on planes of more than {MOST_GROUPS} directions or places, the most that are accepted; "
-                "planes of few stacks are",
-                part=part,
-            )
-        same = alike(int(rest[0]), rest)
-        same[0] = True
-        groups.append(rest[same].tolist())
-        rest = rest[~same]
-    return groups
-
-
-def _alike(first: FramePlane, second: FramePlane) -> bool:
-    turned = max(np.abs(first.row - second.row).max(), np.abs(first.column - second.column).max())
-    return bool(turned <= PARALLEL) and np.allclose(first.spacing, second.spacing, rtol=1e-3)
 
 
 def stack_places(planes: Sequence[FramePlane], finest_mm: float = 0.0) -> tuple[Int[np.ndarray, "n"], float] | None:
@@ -274,7 +138,7 @@ def complete_places(planes: Sequence[FramePlane], part: str) -> tuple[Int[np.nda
 def _fault(planes: Sequence[FramePlane]) -> str | None:
     """What keeps planes, in order, from being a regular stack; they are counted from 1."""
     count, first = len(planes), planes[0]
-    unlike = [number for number, plane in enumerate(planes, 1) if not _alike(first, plane)]
+    unlike = [number + 1 for number in unlike_the_first(planes)]
     if unlike:
         return f"plane {_listed(unlike)} of {count} differs from the first in its direction or the size of its pixels"
     offsets = np.array([first.offset(plane) for plane in planes])

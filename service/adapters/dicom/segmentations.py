@@ -17,15 +17,10 @@ from model.geometry import Grid
 from model.inference.mask_stack import MaskStack
 from model.inference.plane_cover import cover_planes
 from model.inference.stacks import EXCLUDED_VALUE, make_stack
+from service.adapters.dicom.frame_planes import FramePlane, frame_planes
 from service.adapters.dicom.objects import checked_frames, frames_of, tolerant
-from service.adapters.dicom.planes import (
-    DrawnStack,
-    FramePlane,
-    drawn_stacks,
-    frame_planes,
-    parallel_groups,
-    stack_at_home,
-)
+from service.adapters.dicom.plane_groups import parallel_groups
+from service.adapters.dicom.planes import DrawnStack, drawn_stacks, stack_at_home
 from service.adapters.image_guard import ImageLimits
 
 #: SOP classes that are read here.

@@ -10,9 +10,10 @@ from model.errors import InvalidGeometry
 from model.geometry import slab
 from model.inference.mesh import Mesh
 from model.inference.reconstruction import SURFACE_SD
+from service.adapters.dicom.frame_planes import FramePlane, frame_planes
 from service.adapters.dicom.headers import completed
 from service.adapters.dicom.objects import tolerant
-from service.adapters.dicom.planes import FramePlane, ImageGrid, complete_places, frame_planes, grid_at
+from service.adapters.dicom.planes import ImageGrid, complete_places, grid_at
 
 #: Images farther from the surface than this hold nothing of the object: in mm, and in SDs of the surface on top.
 MARGIN_MM, MARGIN_SDS = 2.0, 4.0

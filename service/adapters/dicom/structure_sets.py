@@ -15,15 +15,9 @@ from model.geometry import Grid
 from model.inference.mask_stack import MaskStack
 from service.adapters.dicom.contour_filling import filled
 from service.adapters.dicom.contours import FLATNESS_MM, Contour, closed_contours, ras
-from service.adapters.dicom.planes import (
-    PARALLEL,
-    REGULAR_SHARE,
-    DrawnStack,
-    FramePlane,
-    drawn_stacks,
-    in_groups,
-    on_images,
-)
+from service.adapters.dicom.frame_planes import PARALLEL, FramePlane
+from service.adapters.dicom.plane_groups import REGULAR_SHARE, in_groups
+from service.adapters.dicom.planes import DrawnStack, drawn_stacks, on_images
 from service.adapters.dicom.segmentations import require_room, stacks_of
 from service.adapters.image_guard import ImageLimits
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from model.errors import InconsistentStacks, InvalidMask, InvalidParameter
 from model.geometry import Grid
-from model.inference.annotated_planes import repeat_warnings
+from model.inference.annotated_planes import planes_and_repeats, repeat_warnings
 from model.inference.observations import MaskStack, Plane, find_planes
 from tests.mask_stacks import SHAPE, centres, cut, ellipsoid, found, held, semi_axes, stack_of
 
@@ -276,9 +276,11 @@ class TestRepeats:
         once = find_planes([self.DRAWN], "auto")
         again = replace(self.DRAWN, part="mask[1]")
         assert find_planes([self.DRAWN, again], "auto") == once
-        (told,) = repeat_warnings([self.DRAWN, again], "auto", once)
+        planes, repeats = planes_and_repeats([self.DRAWN, again], "auto")
+        assert planes == once
+        (told,) = repeat_warnings([self.DRAWN, again], repeats)
         assert told.startswith("mask[1] shows 3 plane(s)")
-        assert repeat_warnings([self.DRAWN], "auto", once) == ()
+        assert planes_and_repeats([self.DRAWN], "auto") == (once, ())
 
     def test_a_named_place_counts_once(self):
         named = [Plane(stack, axis, index) for stack in (0, 1) for axis, index in self.PLANES]

@@ -10,8 +10,9 @@ from pydicom.sequence import Sequence as Items
 from pydicom.uid import generate_uid
 
 from model.errors import InvalidGeometry
+from service.adapters.dicom.frame_planes import FramePlane
 from service.adapters.dicom.masks import stacks_of_object
-from service.adapters.dicom.planes import REGULAR_MM, FramePlane, drawn_stacks, stack_places
+from service.adapters.dicom.planes import REGULAR_MM, drawn_stacks, stack_places
 from service.adapters.dicom.series import series_of
 from service.adapters.images import ImageLimits
 from tests.dicom_parts import grid_of, mr_series, reread, ring, rtstruct_of, seg_of

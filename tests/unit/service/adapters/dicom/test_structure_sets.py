@@ -8,7 +8,7 @@ from pydicom.sequence import Sequence as Items
 from pydicom.uid import generate_uid
 
 from model.errors import InvalidGeometry, InvalidMask, InvalidParameter, TooLarge
-from service.adapters.dicom import contours, planes
+from service.adapters.dicom import contours, plane_groups
 from service.adapters.dicom.masks import drawn_labels, frame_of_reference, referenced_series, stacks_of_object
 from service.adapters.dicom.series import series_of
 from service.adapters.images import ImageLimits
@@ -279,9 +279,9 @@ def test_a_drawing_in_more_directions_than_are_accepted_is_refused(images, monke
         ("CLOSED_PLANAR", corners @ np.array([[np.cos(turn), np.sin(turn), 0.0], [0.0, 0.0, 1.0]])) for turn in turns
     ]
     found, roomy = reread(rtstruct_of(images, drawn)), ImageLimits(max_bytes=1 << 24, max_voxels=1 << 26)
-    monkeypatch.setattr(planes, "MOST_GROUPS", 21)
+    monkeypatch.setattr(plane_groups, "MOST_GROUPS", 21)
     assert len(stacks_of_object(found, "mask[0]", roomy)) == 21
-    monkeypatch.setattr(planes, "MOST_GROUPS", 20)
+    monkeypatch.setattr(plane_groups, "MOST_GROUPS", 20)
     with pytest.raises(TooLarge, match="more than 20 directions"):
         stacks_of_object(found, "mask[0]", roomy)
 
