@@ -19,6 +19,12 @@ def ball(radius=6.0, size=20, centre=None, stretch=(1.0, 1.0, 1.0)):
     return (((index - centre) / stretch) ** 2).sum(axis=-1) <= radius**2
 
 
+def egg(n):
+    """A mask of one of many ellipsoids."""
+    index = np.stack(np.meshgrid(*[np.arange(28)] * 3, indexing="ij"), axis=-1)
+    return (((index - 13.5) / [8.0 + 0.4 * n, 9.0, 10.0 - 0.3 * n]) ** 2).sum(axis=-1) <= 1.0
+
+
 def case(name, mask, *, split="train", person=None, spacing=1.0):
     affine = np.diag([spacing, spacing, spacing, 1.0])
     return Case(name, person or name, split, mask, Grid(mask.shape, affine))

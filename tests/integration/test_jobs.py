@@ -73,7 +73,10 @@ def test_each_mask_of_an_archive_is_reconstructed_and_one_at_fault_stops_no_othe
     assert second["problem_type"] == "urn:morphoflow:problem:unreadable-image"
     assert (first["summary"]["space"], fourth["summary"]["space"]) == ("RAS", "LPS")
     assert b"comment space LPS" in files[fourth["file"]]
-    assert "space" not in json.loads(files["manifest.json"])
+    manifest = json.loads(files["manifest.json"])
+    assert "space" not in manifest
+    assert manifest["models"] == [f"{NAME}@1.0.0"]
+    assert manifest["left_out"] == ["masks/read.me"]
     assert files[first["file"]] != files[third["file"]]
     assert first["summary"]["fit"]["converged"]
 

@@ -136,3 +136,23 @@ def test_too_large_a_batch_is_told_of_jobs(client):
     answer = client.get(SAMPLES, params={"count": 10_000})
     assert answer.status_code == 413
     assert "job of kind samples" in answer.json()["detail"]
+
+
+def test_identifiers_may_be_written_in_capitals(client, pair):
+    shouted = [identifier.upper() for identifier in pair]
+    answer = client.get(f"{RECONSTRUCTIONS}/{shouted[0]}/interpolation", params={"with": shouted[1]})
+    told = client.get(f"{RECONSTRUCTIONS}/{pair[0]}/interpolation", params={"with": pair[1]})
+    assert answer.status_code == 200
+    assert answer.content == told.content
+
+
+def test_an_ensembles_draws_are_counted_before_they_come_again(client):
+    made = client.post(RECONSTRUCTIONS, files=mask_parts(), data={"uncertainty": "ensemble"}).json()
+    batch = client.get(made["links"]["posterior"], params={"count": 20, "seed": 20, "format": "ply", "spacing_mm": 2.0})
+    with zipfile.ZipFile(io.BytesIO(batch.content)) as archive:
+        manifest = json.loads(archive.read("manifest.json"))
+    draws = [tuple(sample["latent"]) for sample in manifest["samples"]]
+    assert manifest["members"] == 25
+    assert len(set(draws[:5])) == 5
+    assert len(set(draws[5:])) == 15
+    assert set(draws[5:]) & set(draws[:5])

@@ -1,56 +1,25 @@
+"""The commands export, complete, calibrate and evaluate."""
+
 import csv
 import json
 import shutil
 from dataclasses import replace
 
-import nibabel as nib
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from model.bundle import open_bundle, read_manifest, write_manifest
+from tests.cohort_parts import egg, write
 from training.calibration import SHARES
-from training.cli import register
 from training.cohorts import CohortOptions
 from training.cohorts.sources import CohortSource, open_cohort
-
-SMALL = ["--steps", "6", "--latent-size", "3", "--device", "cpu"]
-
-
-def ellipsoid(n):
-    index = np.stack(np.meshgrid(*[np.arange(28)] * 3, indexing="ij"), axis=-1)
-    return (((index - 13.5) / [8.0 + 0.4 * n, 9.0, 10.0 - 0.3 * n]) ** 2).sum(axis=-1) <= 1.0
-
-
-def write(folder, name, mask):
-    folder.mkdir(parents=True, exist_ok=True)
-    nib.save(nib.Nifti1Image(mask.astype(np.uint8), np.eye(4)), folder / f"{name}.nii.gz")
-
-
-@pytest.fixture
-def masks(tmp_path):
-    for n in range(7):
-        write(tmp_path / "masks" / ("test" if n == 6 else "train"), f"e{n}", ellipsoid(n))
-    return tmp_path / "masks"
-
-
-@pytest.fixture(scope="session")
-def run():
-    app = typer.Typer()
-    register(app)
-
-    def call(*words):
-        return CliRunner().invoke(app, [str(word) for word in words])
-
-    return call
 
 
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory, run):
     folder = tmp_path_factory.mktemp("bundle")
     for n in range(6):
-        write(folder / "masks", f"e{n}", ellipsoid(n))
+        write(folder / "masks", f"e{n}", egg(n))
     words = ("train", "--masks", folder / "masks", "--steps", 150, "--latent-size", 3, "--device", "cpu")
     assert run(*words, "--output", folder / "run").exit_code == 0
     result = run(
@@ -71,119 +40,6 @@ def bundle(tmp_path_factory, run):
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["name"] == "egg"
     return folder / "out"
-
-
-class TestTrain:
-    def test_json_says_what_was_trained_on(self, run, masks, tmp_path):
-        result = run("train", "--masks", masks, *SMALL, "--regime", "thin", "--output", tmp_path / "run", "--json")
-        assert result.exit_code == 0, result.stderr
-        summary = json.loads(result.stdout)
-        assert (summary["train"], summary["validation"], summary["steps"]) == (5, 1, 6)
-        assert np.isfinite(summary["figures"]["loss"])
-
-    def test_a_refused_file_stops_the_training_and_is_named_with_its_reason(self, run, masks, tmp_path):
-        index = np.stack(np.meshgrid(*[np.arange(90)] * 3, indexing="ij"), axis=-1)
-        write(masks / "train", "whale", ((index - 44.5) ** 2).sum(axis=-1) <= 40**2)
-        words = ("train", "--masks", masks, *SMALL, "--output", tmp_path / "run")
-        stopped = run(*words)
-        assert stopped.exit_code == 2
-        assert "whale: it does not belong to the cohort: volume" in stopped.stderr
-        assert "--skip-refused goes on without them" in stopped.stderr
-        assert not (tmp_path / "run").exists()
-        skipped = run(*words, "--skip-refused", "--json")
-        assert skipped.exit_code == 0
-        assert list(json.loads(skipped.stdout)["refused"]) == ["whale"]
-
-    def test_no_bar_and_no_control_sequences_in_a_pipe(self, run, masks, tmp_path):
-        result = run("train", "--masks", masks, *SMALL, "--output", tmp_path / "run")
-        assert result.exit_code == 0
-        assert "\x1b" not in result.output
-        assert "\r" not in result.output
-        assert len(result.stdout.splitlines()) == 1
-
-    def test_a_folder_without_a_run_is_not_resumed(self, run, masks, tmp_path):
-        result = run("train", "--masks", masks, *SMALL, "--output", tmp_path / "run", "--resume")
-        assert result.exit_code == 2
-        assert "holds no run to resume" in result.stderr
-        assert not (tmp_path / "run").exists()
-
-    def test_a_finished_run_is_resumed_without_a_step(self, run, masks, tmp_path):
-        words = ("train", "--masks", masks, *SMALL, "--output", tmp_path / "run", "--json")
-        assert run(*words).exit_code == 0
-        assert run(*words).exit_code == 2
-        again = run(*words, "--resume")
-        assert again.exit_code == 0
-        assert json.loads(again.stdout)["figures"] == {}
-
-    @pytest.mark.parametrize(
-        ("words", "sentence"),
-        [
-            ((), "exactly one is accepted"),
-            (("--cohort", "talus", "--masks", "."), "exactly one is accepted"),
-            (("--cohort", "talus", "--data", "nowhere"), "data folder does not exist"),
-            (("--masks", "nowhere"), "folder of masks does not exist"),
-            (("--masks", ".", "--shippable"), "--shippable goes with --cohort"),
-        ],
-    )
-    def test_bad_input_ends_with_2_and_one_sentence(self, run, words, sentence):
-        result = run("train", *words)
-        assert result.exit_code == 2
-        assert sentence in result.stderr
-        assert "Traceback" not in result.output
-
-    def test_what_stands_in_the_way_is_told_before_the_cohort_is_opened(self, run, tmp_path):
-        (tmp_path / "file").write_text("here")
-        (tmp_path / "run").mkdir()
-        (tmp_path / "run" / "run.json").write_text("{}")
-        for words, sentence in (
-            (("train", "--output", tmp_path / "file" / "x"), "output cannot be written"),
-            (("train", "--output", tmp_path / "run"), "holds a run already"),
-            (("calibrate", tmp_path / "gone"), "folder of the bundle does not exist"),
-            (("complete", tmp_path / "gone"), "folder of the bundle does not exist"),
-            (("calibrate", tmp_path), "has no manifest.json"),
-            (("evaluate", "--model", tmp_path / "gone"), "folder of the model does not exist"),
-            (("evaluate", "--model", "talus", "--output", tmp_path / "file" / "x"), "output cannot be written"),
-            (("evaluate", "--model", "talus", "--output", tmp_path / "file"), "file exists; another name, or --force"),
-            (("evaluate", "--model", "talus", "--record", "--limit", 1), "without --limit and --offset"),
-            (("evaluate", "--model", "talus", "--record", "--offset", 0), "without --limit and --offset"),
-        ):
-            result = run(*words, "--masks", "nowhere")
-            assert result.exit_code == 2
-            assert sentence in result.stderr
-        assert (tmp_path / "file").read_text() == "here"
-
-    def test_patience_without_validation_shapes_is_refused(self, run, masks, tmp_path):
-        """All shapes are one person's, of whom none can be held out."""
-        lines = [f"e{n},one,train" for n in range(6)] + ["e6,other,test"]
-        (masks / "cases.csv").write_text("\n".join(["case,person,split", *lines]))
-        words = ("train", "--masks", masks, *SMALL, "--output", tmp_path / "run")
-        result = run(*words, "--patience", 2)
-        assert result.exit_code == 2
-        assert "no validation cases by which a training could end early" in result.stderr
-        assert not (tmp_path / "run").exists()
-        assert run(*words, "--patience", 0).exit_code == 0
-
-    def test_a_single_shape_is_refused_and_few_are_told_of(self, run, masks, tmp_path):
-        write(tmp_path / "one", "e", ellipsoid(0))
-        assert "cannot tell how shapes differ" in run("train", "--masks", tmp_path / "one", *SMALL).stderr
-        result = run("train", "--masks", masks, *SMALL, "--output", tmp_path / "run")
-        assert "note: 5 training shapes are few" in result.stderr
-
-    def test_reports_name_the_folder_at_fault(self, run, tmp_path):
-        (tmp_path / "empty").mkdir()
-        for folder, words in (("gone", "does not exist"), ("empty", "holds no results")):
-            result = run("report", tmp_path / folder, "--output", tmp_path / "page.html")
-            assert result.exit_code == 2
-            assert f"Folder 1 of 1 ({folder}) {words}" in result.stderr
-
-    def test_steps_and_epochs_exclude_each_other(self, run, masks):
-        result = run("train", "--masks", masks, *SMALL, "--epochs", 2)
-        assert result.exit_code == 2
-        assert "epochs" in result.stderr
-
-    def test_an_unknown_choice_is_refused(self, run):
-        assert run("train", "--cohort", "spleen").exit_code == 2
-        assert run("train", "--cohort", "talus", "--regime", "sparse").exit_code == 2
 
 
 def held_out(masks, options):
@@ -249,7 +105,7 @@ class TestExport:
 
     def test_the_prior_is_not_chosen_on_another_cohort(self, run, bundle, tmp_path):
         for n in range(5):
-            write(tmp_path / "masks", f"other{n}", ellipsoid(20 + n))
+            write(tmp_path / "masks", f"other{n}", egg(20 + n))
         result = run("export", bundle.parent / "run", "--output", tmp_path / "out", "--masks", tmp_path / "masks")
         assert result.exit_code == 2
         assert "trained on other shapes" in result.stderr
@@ -261,7 +117,7 @@ class TestExport:
         assert "chooses how much" in result.stderr
 
     def test_a_cohort_without_validation_shapes_chooses_nothing(self, run, bundle, tmp_path):
-        write(tmp_path / "masks", "only", ellipsoid(0))
+        write(tmp_path / "masks", "only", egg(0))
         words = ("export", bundle.parent / "run", "--output", tmp_path / "out", "--masks", tmp_path / "masks")
         result = run(*words)
         assert result.exit_code == 2
@@ -386,7 +242,7 @@ class TestEvaluate:
 
     def test_a_split_without_cases_is_refused(self, run, bundle, tmp_path):
         for n in range(4):
-            write(tmp_path / "train", f"e{n}", ellipsoid(n))
+            write(tmp_path / "train", f"e{n}", egg(n))
         result = run("evaluate", "--model", bundle, "--masks", tmp_path)
         assert result.exit_code == 2
         assert "no test cases; train with --test-fraction" in result.stderr

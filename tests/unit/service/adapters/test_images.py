@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from model.errors import InputError, InvalidMask, TooLarge
+from model.errors import InputError, InvalidMask, TooLarge, UnreadableImage
 from model.geometry import Grid
 from model.inference.observations import find_planes
 from service.adapters.images import ImageLimits, image_format, read_mask, write_nifti
@@ -281,6 +281,13 @@ def test_real_masks_read_as_nibabel_reads_them(shared_data):
         stack = read_mask(path, "mask[0]", limits)
         np.testing.assert_array_equal(stack.foreground, np.asanyarray(image.dataobj) != 0)
         np.testing.assert_allclose(stack.grid.affine, image.affine, atol=1e-9)
+
+
+@pytest.mark.parametrize("skip", [b"byte skip: -1", b"line skip: 2", b"byteskip: 12"])
+def test_skips_of_nrrd_are_named_for_what_they_are(skip):
+    data = nrrd_text("6 7 8").replace(b"space origin:", skip + b"\nspace origin:")
+    with pytest.raises(UnreadableImage, match=r"mask\[0\] skips bytes or lines"):
+        read_mask(data, "mask[0]", LIMITS)
 
 
 @pytest.mark.parametrize("origin", [b"(1,2)", b"(1,2,3,4)"])

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydicom import Dataset
 from pydicom.sequence import Sequence as Items
 from pydicom.uid import generate_uid
 
-from model.errors import InvalidGeometry, InvalidMask, InvalidParameter, TooLarge
+from model.errors import InvalidGeometry, InvalidMask, InvalidParameter, TooLarge, UnreadableImage
 from service.adapters.dicom import contours, plane_groups
 from service.adapters.dicom.masks import drawn_labels, frame_of_reference, referenced_series, stacks_of_object
 from service.adapters.dicom.series import series_of
@@ -286,7 +287,7 @@ def test_a_drawing_in_more_directions_than_are_accepted_is_refused(images, monke
         stacks_of_object(found, "mask[0]", roomy)
 
 
-@pytest.mark.parametrize(("name", "most"), [("MOST_CONTOURS", 1), ("MOST_POINTS", 7)])
+@pytest.mark.parametrize(("name", "most"), [("MOST_CONTOURS", 1), ("MOST_OF_ONE", 3), ("MOST_POINTS", 7)])
 def test_more_contours_or_points_than_are_accepted_are_refused(images, monkeypatch, name, most):
     found = reread(rtstruct_of(images, [("CLOSED_PLANAR", square(images, radius)) for radius in (3.0, 7.0)]))
     monkeypatch.setattr(contours, name, most + 1)
@@ -297,3 +298,25 @@ def test_more_contours_or_points_than_are_accepted_are_refused(images, monkeypat
     monkeypatch.setattr(contours, name, 0)
     with pytest.raises(TooLarge, match="choose regions"):
         drawn_labels(found, "mask[0]")
+
+
+@pytest.mark.parametrize(
+    ("kind", "data"),
+    [("POINT", None), ("OPEN_PLANAR", None), ("CLOSED_PLANAR", []), ("CLOSED_PLANAR", ["1", "2", "3"])],
+)
+def test_a_contour_that_holds_no_area_is_passed_over_beside_one_that_does(images, kind, data):
+    found = rtstruct_of(images, [("CLOSED_PLANAR", square(images, 7.0))])
+    item = Dataset()
+    item.ContourGeometricType = kind
+    if data is not None:
+        item.ContourData = data
+    found.ROIContourSequence[0].ContourSequence.append(item)
+    (stack,) = stacks_of_object(reread(found), "mask[0]", LIMITS, home=series_of(images).grid)
+    assert stack.foreground.sum() == 14**2
+
+
+def test_a_closed_contour_without_its_data_is_damage(images):
+    found = rtstruct_of(images, [("CLOSED_PLANAR", square(images, 7.0))])
+    del found.ROIContourSequence[0].ContourSequence[0].ContourData
+    with pytest.raises(UnreadableImage, match="damaged"):
+        stacks_of_object(reread(found), "mask[0]", LIMITS)
