@@ -75,8 +75,8 @@ def positive_nodes(field: IndexField, shape: Int[np.ndarray, "3"]) -> Bool[np.nd
     signs[tuple(nodes.T)] = np.where(values > 0, 1, -1)
     for axis in (2, 1, 0):
         layers = np.moveaxis(signs, axis, 0)
-        for last, layer in (*pairwise(layers), *pairwise(layers[::-1])):
-            np.copyto(layer, last, where=layer == 0)
+        for known, layer in (*pairwise(layers), *pairwise(layers[::-1])):
+            np.copyto(layer, known, where=layer == 0)
     return signs > 0
 
 

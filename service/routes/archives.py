@@ -18,8 +18,6 @@ from service.routes.responses import ZIP, attachment
 
 #: Makes one file; passes the check that it is given before each evaluation.
 MakeFile = Callable[[Check], SampleFile]
-
-
 #: A client that takes nothing for so long (s) is taken for gone.
 STALLED_S = 120.0
 
