@@ -35,6 +35,8 @@ from service.adapters.pacs.sop_classes import PROPOSED_SYNTAXES
 SHAPE, SPACING_MM = (40, 56, 14), (1.0, 1.0, 3.0)
 #: Sender's wait before an object that was not acknowledged is sent again (s), and how many go into one association.
 RESEND_S, AT_ONCE = 0.5, 25
+#: How often images are sent to the archive, which has to hold all of them before the storm begins.
+ATTEMPTS = 20
 #: How often the progress is told (s).
 TOLD_S = 30.0
 
@@ -163,7 +165,7 @@ def _study(orthanc: Orthanc, number: int) -> Dataset:
     """Images into the archive; the drawing on them."""
     grid = Grid(SHAPE, np.diag([*SPACING_MM, 1.0]))
     images = series_around(grid, f"STORM-{number}")
-    _send(images, orthanc.dicom_port, "ORTHANC")
+    _send_all(images, orthanc.dicom_port, "ORTHANC")
     return as_seg(images, three_planes(placed(EXAMPLE, grid)))
 
 
@@ -232,6 +234,18 @@ def _wait_for_the_end(client: httpx.Client) -> None:
     """Until nothing is left to be given back."""
     while "morphoflow_dicom_backlog 0.0" not in client.get("/metrics").text:
         time.sleep(RESEND_S)
+
+
+def _send_all(objects: Sequence[Dataset], port: int, title: str) -> None:
+    """C-STORE until every object was acknowledged: a busy archive may let an association go."""
+    waiting = list(objects)
+    for _ in range(ATTEMPTS):
+        taken = set(_send(waiting, port, title))
+        waiting = [found for found in waiting if str(found.SOPInstanceUID) not in taken]
+        if not waiting:
+            return
+        time.sleep(RESEND_S)
+    raise SystemExit(f"The archive did not take {len(waiting)} of {len(objects)} images in {ATTEMPTS} attempts.")
 
 
 def _send(objects: Sequence[Dataset], port: int, title: str) -> list[str]:

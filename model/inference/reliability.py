@@ -101,14 +101,16 @@ def less_trusting(
     """Model and fit with less trust in the drawing when that is rough, otherwise as they are.
 
     First a better place and a single plane that is to blame are looked for, more thoroughly than in any fit. Drawings
-    on thick slices are not judged. A fit that is found good comes back with its discrepancy.
+    on thick slices are not judged. Fits are judged by their codes' shapes, so that no drawing is completed on the way; a
+    good one comes back with its discrepancy where nothing completes it.
     """
     if any(thickness_mm(stacks[plane.stack], plane) for plane in observations.planes):
         return model, found
+    alone = replace(model, completer=None)
     for tried in _ever_harder(model, observations, found, options):
-        judged = corrected(model, tried, stacks, observations, prior)
+        judged = corrected(alone, tried, stacks, observations, prior)
         if not _is_rough(model, judged, observations):
-            return model, judged
+            return model, judged if model.completer is None else tried
     lower = ROUGH_SHARE * model.manifest.likelihood_precision
     doubting = replace(model, manifest=replace(model.manifest, likelihood_precision=lower))
     doubted = refit(doubting, observations, tried, options)
