@@ -101,7 +101,7 @@ def less_trusting(
     """Model and fit with less trust in the drawing when that is rough, otherwise as they are.
 
     First a better place and a single plane that is to blame are looked for, more thoroughly than in any fit. Drawings
-    on thick slices are not judged. Fits are judged by their codes' shapes, so that no drawing is completed on the way; a
+    on thick slices are not judged. Fits are judged by their codes' shapes, so no drawing is completed on the way; a
     good one comes back with its discrepancy where nothing completes it.
     """
     if any(thickness_mm(stacks[plane.stack], plane) for plane in observations.planes):
