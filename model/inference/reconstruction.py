@@ -26,6 +26,7 @@ from model.inference.mesh import Mesh
 from model.inference.objective import Place, reweighted
 from model.inference.observations import AnnotatedRule, MaskStack, Observations, Plane, observe
 from model.inference.one_body import separate_warnings
+from model.inference.other_side import nats_of_other_side, other_side_warnings, percentile_beside
 from model.inference.posterior import FieldDerivatives, fitted_logits, laplace_covariance
 from model.inference.reliability import figures_of, less_trusting, reliability_warnings, thickness_warnings
 from model.inference.rivals import rival_warnings
@@ -163,7 +164,7 @@ def reconstruct(
     planes, again = planes_and_repeats(stacks, options.annotated, farthest_mm(model))
     drawing = observe(stacks, planes, budget=OBSERVATION_BUDGET, cover=COVER_SHARE_OF_BAND, seed=options.seed)
     watch("fit")
-    usual = discrepancy_prior(model.manifest)
+    usual, trusting = discrepancy_prior(model.manifest), model
     model, settled, observations = _settled(model, stacks, drawing, FitOptions(mirror=options.mirror), usual)
     found = corrected(model, settled, stacks, drawing, discrepancy_prior(model.manifest, options.fidelity))
     watch("surface")
@@ -186,7 +187,10 @@ def reconstruct(
     sections = sections_of(observations, logits, found.plane_weights)
     figures = figures_of(model, found, stacks, drawing, mesh, usual, plain_sd)
     thick = thickness_warnings(stacks, observations.planes, mesh)
-    density, percentile = typicality(model, found, replace(figures, misfit_mm=0.0) if thick else figures)
+    judged = replace(figures, misfit_mm=0.0) if thick else figures
+    density, percentile = typicality(model, found, judged)
+    other_side = nats_of_other_side(trusting, trusted, found, judged, options.mirror)
+    percentile = percentile_beside(percentile, other_side)
     probabilities = predictive_probabilities(model, sections)
     named = [*disagreeing_planes(sections), *filter(None, [_doubted(observations, found)])]
     return Reconstruction(
@@ -208,6 +212,7 @@ def reconstruct(
         + separate_warnings(observations, logits, mesh)
         + rival_warnings(found)
         + typicality_warnings(model, percentile)
+        + other_side_warnings(other_side)
         + plane_warnings(sections, _doubted(observations, found))
         + predictive_warnings(sections, probabilities, named)
         + coverage_warnings(trusted, mesh.vertices)

@@ -53,15 +53,28 @@ def typicality(model: ShapeModel, found: Fit, figures: Figures) -> tuple[float, 
     known = model.manifest.typical
     if not known:
         return density, float(100.0 * np.mean(model.population.log_densities < density))
-    misfit_mm = _trusting_misfit(found, figures)
-    tails = []
-    if figures.planes <= MOST_USUAL_PLANES or not misfit_mm > 0.0:
+    deviation = misfit_deviation(known, found, figures)
+    tails = [] if deviation is None else [_tail(known, deviation)]
+    if figures.planes <= MOST_USUAL_PLANES or deviation is None:
         rare = float(rarity(np.array([density]), known["density_peak"])[0])
         tails.append(_tail(known, (rare - known["rarity_mean"]) / known["rarity_sd"]))
-    if misfit_mm > 0.0:
-        usual = known["misfit_mean"] + known["misfit_exponent"] * np.log(usual_share(figures.planes))
-        tails.append(_tail(known, (np.log(misfit_mm) - usual) / known["misfit_sd"]))
     return density, 100.0 * (1.0 - (1.0 - min(tails)) ** len(tails))
+
+
+def misfit_deviation(known: Mapping[str, float], found: Fit, figures: Figures) -> float | None:
+    """By how many SDs the contours lie farther from a fit than those of sound drawings usually do.
+
+    Args:
+        known: `Manifest.typical`.
+
+    Returns:
+        None where the misfit was not looked at, or what is usual is not known.
+    """
+    misfit_mm = _trusting_misfit(found, figures)
+    if not known or not misfit_mm > 0.0:
+        return None
+    usual = known["misfit_mean"] + known["misfit_exponent"] * np.log(usual_share(figures.planes))
+    return float((np.log(misfit_mm) - usual) / known["misfit_sd"])
 
 
 def typicality_warnings(model: ShapeModel, percentile: float) -> tuple[str, ...]:
