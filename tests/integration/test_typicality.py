@@ -50,3 +50,12 @@ def test_hippocampi_are_not_flagged(hippocampus, shared_data):
     answers = [answer(hippocampus, case.mask, case.grid, "orthogonal") for case in cases]
     flagged = [found for found in answers if any(UNLIKE in sentence for sentence in found.warnings)]
     assert len(flagged) <= 1
+
+
+@pytest.mark.parametrize("regime", ["orthogonal", "thin"])
+def test_hippocampi_of_the_other_side_are_flagged_with_the_way_out(hippocampus, shared_data, regime):
+    cases = load_cohort(CohortName.HIPPOCAMPUS, shared_data, CohortOptions()).test[:6]
+    answers = [answer(hippocampus, case.mask[::-1].copy(), case.grid, regime) for case in cases]
+    told = [found for found in answers if any("mirror=auto" in sentence for sentence in found.warnings)]
+    assert len(told) >= 5
+    assert all(any(UNLIKE in sentence for sentence in found.warnings) for found in told)
