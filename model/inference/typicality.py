@@ -6,16 +6,16 @@ that the contours stay far from it. Both are held against what answers to sound 
 density than one that was trained on a dense mask. How far a density lies below that of the mean shape is distributed
 much like a chi square, whose cube root is nearly normal (Wilson and Hilferty 1931); so is the logarithm of a misfit. A
 figure that is worse than usual by ``z`` SDs has the tail probability of Student's distribution, the predictive one for
-estimates from few shapes. The less probable of the two counts, for what the least of two is (Sidak 1967). More planes
-than were measured with take the code farther from the middle than any sparse drawing would: then the misfit is judged
-alone.
+estimates from few shapes. Both count together, by the sum of the squares of what is worse than usual (a chi-bar-square,
+Kudo 1963; on sound drawings of hippocampi the two correlate by 0.05 to 0.08). More planes than were measured with take
+the code farther from the middle than any sparse drawing would: then the misfit is judged alone.
 """
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import stdtr
+from scipy.special import chdtrc, ndtri, stdtr
 
 from model.bundle import ShapeModel
 from model.inference.agreement import Section
@@ -30,6 +30,8 @@ ATYPICAL_PERCENTILE, ATYPICAL_BY_DENSITY = 0.5, 1.0
 FEWEST_CODES = 50
 #: A slice is told of when sound drawings would disagree as much with so small a probability.
 SURPRISING = 1e-3
+#: No tail is taken for less probable.
+LEAST_TAIL = 1e-300
 
 
 def peak_density(model: ShapeModel) -> float:
@@ -58,7 +60,7 @@ def typicality(model: ShapeModel, found: Fit, figures: Figures) -> tuple[float, 
     if figures.planes <= MOST_USUAL_PLANES or deviation is None:
         rare = float(rarity(np.array([density]), known["density_peak"])[0])
         tails.append(_tail(known, (rare - known["rarity_mean"]) / known["rarity_sd"]))
-    return density, 100.0 * (1.0 - (1.0 - min(tails)) ** len(tails))
+    return density, 100.0 * _joint_tail(tails)
 
 
 def misfit_deviation(known: Mapping[str, float], found: Fit, figures: Figures) -> float | None:
@@ -129,6 +131,16 @@ def _trusting_misfit(found: Fit, figures: Figures) -> float:
     """Misfit (mm) of the fit that trusts the drawing, as those were that it is held against; 0 when not looked at."""
     rough = found.full_trust_misfit_mm
     return figures.misfit_mm if rough is None or not figures.misfit_mm > 0.0 else rough
+
+
+def _joint_tail(tails: Sequence[float]) -> float:
+    """How probable figures are that are, together, at least as much worse than usual; one figure's tail is its own."""
+    if len(tails) == 1:
+        return tails[0]
+    worse = float(np.square(np.maximum(-ndtri(np.maximum(tails, LEAST_TAIL)), 0.0)).sum())
+    if worse == 0.0:
+        return 1.0
+    return float(0.5 * chdtrc(1, worse) + 0.25 * chdtrc(2, worse))
 
 
 def _tail(known: Mapping[str, float], z: float) -> float:

@@ -76,6 +76,25 @@ def test_as_many_real_shapes_lie_below_a_percentile_as_it_says(dimensions):
         assert np.mean(tails < share) == pytest.approx(share, abs=tolerance)
 
 
+@pytest.mark.parametrize("share", [0.2, 0.05, 0.01])
+def test_as_many_real_shapes_lie_below_a_percentile_by_both_figures(share):
+    random = np.random.default_rng(7)
+    rare, far = random.standard_normal((2, 4000))
+    latents = [np.array([np.sqrt(2.0 * max(1.0 + 0.3 * z, 0.0) ** 3), 0.0, 0.0]) for z in rare]
+    known = {**KNOWN, "freedom": 1e6, "misfit_exponent": 0.0}
+    model = replace(PLAIN, manifest=replace(PLAIN.manifest, typical=known))
+    found = [
+        typicality(model, replace(FOUND, latent=latent), Figures(5, USUAL * float(np.exp(0.2 * z)), 0.3))[1]
+        for latent, z in zip(latents, far, strict=True)
+    ]
+    assert np.mean(np.array(found) < 100.0 * share) == pytest.approx(share, abs=3.0 * np.sqrt(share / 4000))
+
+
+def test_two_figures_that_are_both_bad_are_worse_than_either():
+    rare, far = (0.0, 0.0, 2.4), USUAL * float(np.exp(0.4))
+    assert percentile(far, latent=rare) < 0.5 * min(percentile(far), percentile(USUAL, latent=rare))
+
+
 def test_the_mean_shape_has_the_density_that_others_are_held_against():
     assert peak_density(PLAIN) == pytest.approx(KNOWN["density_peak"])
     assert rarity(np.array([peak_density(PLAIN)]), peak_density(PLAIN)) == 0.0
