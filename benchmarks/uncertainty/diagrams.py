@@ -4,6 +4,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -16,14 +17,17 @@ COLOURS = {"laplace": "#08519c", "ensemble": "#e6550d", "advised": "#08519c", "r
 
 
 def save_diagrams(cells: Cells, cohort: str, path: Path) -> None:
-    """Reliability of voxels, error by SD of vertices, and ASD by number of planes, for one cohort."""
+    """Reliability of voxels, error by SD of vertices, and ASD by number of planes where that was looked at."""
     answers = [p for key, p in cells.items() if key.kind == "answer" and key.cohort == cohort]
     mpl.use("Agg")
-    figure = Figure(figsize=(12.0, 4.0), layout="constrained")
-    panels = figure.subplots(1, 3)
+    curves = _curves_of(cells, cohort)
+    count = 3 if curves else 2
+    figure = Figure(figsize=(4.0 * count, 4.0), layout="constrained")
+    panels = figure.subplots(1, count)
     _reliability(panels[0], answers)
     _errors(panels[1], answers)
-    _curves(panels[2], cells, cohort)
+    if curves:
+        _draw_curves(panels[2], curves)
     figure.suptitle(cohort)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
@@ -53,11 +57,15 @@ def _errors(panel: Axes, answers: list[dict[str, object]]) -> None:
     panel.legend()
 
 
-def _curves(panel: Axes, cells: Cells, cohort: str) -> None:
-    for strategy in ("advised", "random"):
-        curve = curve_of(cells, cohort, strategy)
-        if curve is not None:
-            panel.plot(FIRST + np.arange(len(curve)), curve, "o-", color=COLOURS[strategy], label=strategy)
+def _curves_of(cells: Cells, cohort: str) -> dict[str, Float[np.ndarray, "n"]]:
+    """ASD (mm) by number of planes for each strategy that was followed."""
+    curves = {strategy: curve_of(cells, cohort, strategy) for strategy in ("advised", "random")}
+    return {strategy: curve for strategy, curve in curves.items() if curve is not None}
+
+
+def _draw_curves(panel: Axes, curves: dict[str, Float[np.ndarray, "n"]]) -> None:
+    for strategy, curve in curves.items():
+        panel.plot(FIRST + np.arange(len(curve)), curve, "o-", color=COLOURS[strategy], label=strategy)
     panel.set(xlabel="planes", ylabel="ASD (mm)", title="where to draw next")
     panel.set_ylim(bottom=0.0)
     panel.legend()
