@@ -40,10 +40,9 @@ def nats_of_other_side(
     if mirror == "auto" or deviation is None or deviation < LOOKED_AT:
         return 0.0
     other = cast(MirrorRule, {"never": "always", "always": "never"}[mirror])
-    own, mirrored = (
-        fit(model, observations, FitOptions(mirror=side, robust=False)).objective for side in (mirror, other)
-    )
-    return max(0.0, own - mirrored)
+    # A rough drawing's fit has another objective than one that trusts the drawing in full.
+    own = found.objective if found.trust == 1.0 else _objective(model, observations, mirror)
+    return max(0.0, own - _objective(model, observations, other))
 
 
 def percentile_beside(percentile: float, nats: float) -> float:
@@ -60,3 +59,8 @@ def other_side_warnings(nats: float) -> tuple[str, ...]:
         "left and right were exchanged; mirror=auto tries both."
     )
     return (sentence,)
+
+
+def _objective(model: ShapeModel, observations: Observations, side: MirrorRule) -> float:
+    """Negative log posterior (nats) of the best fit on a side, on all of the observations."""
+    return fit(model, observations, FitOptions(mirror=side, robust=False)).objective
